@@ -125,6 +125,7 @@ def importable(monkeypatch):
     [
         ("hangs", "hangs: no answer in 1 s"),
         ("crashes", "ended with 7"),
+        ("nothing_of_that_name", "MODULE:function that can be imported"),
         ("draws_nothing", "draws nothing"),
         ("counts", "returned int64, neither floats nor uint8"),
     ],
@@ -217,7 +218,7 @@ def test_a_program_may_write_an_exr(tmp_path):
         (["x", "--command", "false"], "{out} (or {exr}) in it, found 'false'"),
         (["x", "--command", "no_such_program {out}"], "a program that can be run, found 'no_such_program'"),
         (["x", "--command", "prog {scene} {out}"], "expected {ply}, {cameras} and {out}"),
-        (["x", "--command", "prog '{out}"], "expected {ply}, {cameras} and {out}"),
+        *((["x", "--command", f"prog {wrong}"], "expected {ply}, {cameras}") for wrong in ("'{out}", "{ply.x} {out}")),
         (["wrong_renderer:torch"], "expected a function, found module"),
         (["audit_targets.own:manual", "--case", "nothing"], "expected one of one, two"),
         (["audit_targets.own:manual", "--case", "one", "--limit", "nan"], "--limit: expected a finite number"),

@@ -26,8 +26,8 @@ UTM = np.array([691_000.25, 5_335_000.5, 520.0])
 COUNT = 16
 
 
-def model_of(centers, random):
-    """Cameras at centers [N, 3] (x east, y north, z up) that look level, in another frame."""
+def model_of(centers, random, down=False):
+    """Cameras at centers [N, 3] (x east, y north, z up) that look level, or down, in another frame."""
     model = pycolmap.Reconstruction()
     lens = pycolmap.Camera(camera_id=1, model="PINHOLE", width=8, height=8, params=[8, 8, 4, 4])
     model.add_camera_with_trivial_rig(lens)
@@ -35,6 +35,8 @@ def model_of(centers, random):
         forward = np.append(random.normal(size=2), 0.0)
         forward /= np.linalg.norm(forward)
         rotation = np.stack([np.cross(forward, (0, 0, 1)), (0, 0, -1), forward])
+        if down:
+            rotation = np.stack([rotation[0], -forward, (0, 0, -1)])
         pose = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), -rotation @ center)
         image = pycolmap.Image(name=f"{index}.jpg", camera_id=1, image_id=index + 1)
         model.add_image_with_trivial_frame(image, pose)
@@ -72,6 +74,20 @@ def test_positions_place_a_model_and_outliers_are_left_out(tmp_path, along):
     np.testing.assert_allclose(down, np.broadcast_to((0, 1, 0), down.shape), atol=0.01)
 
 
+@pytest.mark.parametrize(("looks", "wrong"), [("level", "swapped"), ("down", "swapped"), ("level", "at one place")])
+def test_positions_that_cannot_be_right_are_refused(tmp_path, looks, wrong):
+    """What is flat turns over where x and y are exchanged: a mirror is no rotation."""
+    random = np.random.default_rng(3)
+    centers = random.uniform(-20, 20, (COUNT, 3)) * (1, 1, 0.02)
+    model = model_of(centers, random, looks == "down")
+    world = np.zeros((COUNT, 3)) if wrong == "at one place" else centers[:, [1, 0, 2]]
+    source = write_positions(tmp_path / "a.csv", world + UTM)
+    said = "they span 0 m" if wrong == "at one place" else "x and y were exchanged"
+    with pytest.raises(InputError, match=said):
+        georeference(model, tmp_path, source, 0, print)
+    assert georeference(model, tmp_path, write_positions(tmp_path / "b.csv", centers + UTM), 0, print)
+
+
 def test_distances_give_the_scale_and_cameras_the_up_and_unknown_names_are_told(tmp_path):
     random = np.random.default_rng(4)
     centers = random.uniform(-5, 5, (COUNT, 3))
@@ -98,6 +114,7 @@ def test_distances_give_the_scale_and_cameras_the_up_and_unknown_names_are_told(
         ("name,x,y,z\na.jpg,1,2,b", "without numbers"),
         ("name,x,y,z\na.jpg,1,2,3\nb.jpg,1,nan,3", "found the line b.jpg,1,nan,3"),
         ("name,x,y,z\na.jpg,1,2,3", "of at least 3 photographs"),
+        ("name,x,y,z\na.jpg,1,2,3\nb.jpg,1,2,3\n  \na.jpg,1,2,4", "more than one line for a.jpg"),
         ("name,other,distance\na.jpg,b.jpg,3", "above 0 of registered photographs such as 0.jpg"),
         ("name,other,distance\n0.jpg,1.jpg,2\n0.jpg,1.jpg,0", "distances above 0"),
         ("name,other,distance\n0.jpg,1.jpg,-3", "distances above 0"),
@@ -123,21 +140,24 @@ def test_a_file_that_cannot_be_read_is_refused_before_cameras_are_computed(tmp_p
     assert "begins with name,x,y,z" in capsys.readouterr().err and not (tmp_path / "scene").exists()
 
 
-def test_gps_of_photographs_is_read_as_utm(tmp_path):
-    """Against the zone's own middle meridian: 500 km east, and there the scale is 0.9996."""
+@pytest.mark.parametrize("latitude", [48, 0])
+def test_gps_of_photographs_is_read_as_utm(tmp_path, latitude):
+    """Against the zone's own middle meridian: 500 km east, and there the scale is 0.9996. Also across the equator."""
     for index in range(3):
         exif = Image.new("RGB", (64, 48)).getexif()
-        exif.get_ifd(0x8825).update(
-            {1: "N", 2: (48.0, 0.0, 36.0 * index), 3: "E", 4: (9.0, 0.0, 0.0), 5: b"\0", 6: 500.0}
-        )
+        north = latitude + index > 0
+        seconds = 36.0 * (index or not latitude)
+        exif.get_ifd(0x8825).update({1: "SN"[north], 2: (latitude, 0.0, seconds), 3: "E", 4: (9.0, 0.0, 0.0)})
+        exif.get_ifd(0x8825).update({5: b"\0", 6: 500.0})
         Image.effect_noise((64, 48), 50).convert("RGB").save(tmp_path / f"{index}.jpg", exif=exif)
     database = tmp_path / "database.db"
     stages.opened(database).close()
     pycolmap.import_images(database, tmp_path, image_names=[f"{index}.jpg" for index in range(3)])
     found, reference = _gps(database)
     assert "UTM zone 32 north" in reference
+    apart = 0.9996 * (1111.97 if latitude else 2 * 1105.74)  # a hundredth of a degree, or two
     np.testing.assert_allclose([found[f"{k}.jpg"][[0, 2]] for k in range(3)], [(500_000, 500)] * 3, atol=0.01)
-    assert abs((found["1.jpg"] - found["0.jpg"])[1] - 0.9996 * 1111.97) < 1.0  # a hundredth of a degree
+    assert abs((found["1.jpg"] - found["0.jpg"])[1] - apart) < 1.0
 
 
 @pytest.mark.parametrize("ending", [".ply", ".compressed.ply", ".glb", ".gltf"])

@@ -233,6 +233,12 @@ def test_gradients_of_what_meta_shows_and_sparse_ones():
         around = meta["means2d"].grad if packed else meta["means2d"].grad[(meta["radii"] > 0).all(-1)]
         found.append([grad.to_dense() for grad in (*grads, around)])
     assert all(torch.allclose(one, other, rtol=1e-5, atol=1e-5) for one, other in zip(*found, strict=True))
+    for packed in (False, True):
+        covars = torch.diag_embed(call_of()["scales"].detach() ** 2).requires_grad_()
+        given = call_of() | {"quats": None, "scales": None, "covars": covars}
+        rasterization(**given, packed=packed, sparse_grad=packed)[0].square().sum().backward()
+        found.append([covars.grad.to_dense()])
+    assert torch.allclose(*found[2], *found[3], rtol=1e-5, atol=1e-5) and found[2][0].any()
     clipped = rasterization(**call_of(radius_clip=8.0))[2]
     assert (clipped["radii"] > 8).any(-1).all() and len(clipped["radii"]) > 0
 

@@ -17,6 +17,7 @@ from warp_splat.camera import Camera
 from warp_splat.cli import main
 from warp_splat.errors import InputError
 from warp_splat.formats import model_folder
+from warp_splat.formats.coordinates import write_coordinates
 from warp_splat.formats.exchange import load_gaussians, save_gaussians
 from warp_splat.formats.splats import SplatFile
 from warp_splat.scene.types import Decoded, View
@@ -201,17 +202,26 @@ def test_default_model_path_is_new_each_time():
 
 
 @pytest.mark.parametrize("mark", [False, True])
-def test_open_model(tmp_path, mark, monkeypatch, fails):
+def test_open_model(tmp_path, mark, monkeypatch, fails, capsys):
     """cfg_args goes before the file's own mark of antialiasing, which goes before nothing; convert does likewise."""
     folder, target = tmp_path / "model", tmp_path / "a.spz"
     for iteration in (3, 20):
         save_gaussians(model_folder.ply_path(folder, iteration), SplatFile(some_splats(iteration), mark))
     iteration, file, options = model_folder.open_model(folder)
-    assert (iteration, len(file.splats.means), options) == (20, 20, {"eval": True, "antialiasing": mark})
+    told = {"antialiasing": mark, "linear_light": False}
+    assert (iteration, len(file.splats.means), options) == (20, 20, {"eval": True, **told})
     assert model_folder.open_model(model_folder.ply_path(folder, 3))[::2] == (0, options)
     assert main(["convert", str(folder), str(target)]) == 0 and load_gaussians(target).antialiased == mark
     monkeypatch.chdir(write_colmap(tmp_path / "scene"))  # which it was not trained on
     assert "name the scene with -s" in fails("render", "-m", folder)
-    model_folder.write_cfg_args(folder, {"antialiasing": not mark, "eval": False})
-    assert model_folder.open_model(folder, 3)[::2] == (3, {"antialiasing": not mark, "eval": False})
+    trained = {"antialiasing": not mark, "linear_light": True, "white_background": True, "projection": "ellipsoid"}
+    model_folder.write_cfg_args(folder, trained | {"eval": False})
+    write_coordinates(folder, {"origin": [1.0, 2.0, 3.0]})
+    assert model_folder.open_model(folder, 3)[::2] == (3, trained | {"eval": False})
     assert main(["convert", str(folder), str(target)]) == 0 and load_gaussians(target).antialiased != mark
+    said = capsys.readouterr().out
+    for lost in ("in the world", "in linear light", "projection (ellipsoid)", "white background"):
+        assert lost in said
+    assert main(["convert", str(folder), str(tmp_path / "a.glb")]) == 0
+    drawn = model_folder.open_model(tmp_path / "a.glb")
+    assert drawn[1].linear and drawn[1].coordinates["origin"] == [1.0, 2.0, 3.0] and drawn[2]["linear_light"]

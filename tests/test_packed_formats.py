@@ -50,7 +50,7 @@ def test_spz_bytes_are_the_documented_layout(tmp_path, degree):
 
 def test_spz_version_2(tmp_path):
     spz2(tmp_path / "a.spz")
-    splats, antialiased, _ = load_gaussians(tmp_path / "a.spz", report=silent)
+    splats, antialiased, *_ = load_gaussians(tmp_path / "a.spz", report=silent)
     np.testing.assert_array_equal(splats.means, [[1, -2, -3]])
     np.testing.assert_array_equal(splats.scales, [[0, 0, 1]])
     np.testing.assert_allclose(splats.sh[0, 0], [-0.5 / 0.15, 0.002 / 0.15, 0.5 / 0.15], atol=0.001)

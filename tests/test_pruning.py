@@ -1,5 +1,6 @@
 """What Gaussians do to images against images without them; what simplify and clean leave out, and their sentences."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from warp_splat.cli import main
 from warp_splat.compare.scenes import make_camera
 from warp_splat.config import RasterOptions
+from warp_splat.formats.coordinates import write_coordinates
 from warp_splat.formats.exchange import load_gaussians, save_gaussians
 from warp_splat.formats.model_folder import ply_path, write_cfg_args
 from warp_splat.formats.splats import SplatArrays, SplatFile
@@ -298,9 +300,11 @@ def test_clean_reports_before_and_after(folder, tmp_path, capsys):
     copy = tmp_path / "model"
     save_gaussians(ply_path(copy, 7), SplatFile(planted))
     write_cfg_args(copy, {"source_path": str(embedded_scene()), "resolution": 8, "eval": True})
+    write_coordinates(copy, {"origin": [1.0, 2.0, 3.0]})
     arguments = ["clean", str(copy), "-o", str(output), "--device", "cpu"]
     assert main(arguments) == 0
     out = capsys.readouterr().out
+    assert re.search("lost: .*where they are in the world", out)
     left = int(out.split(f"{output}: ")[1].split(" of ")[0])
     assert len(planted.means) - 20 < left < len(planted.means)
     gain = float(out.split("train PSNR")[1].split("(")[1].split(")")[0])

@@ -66,10 +66,16 @@ def test_defaults_of_torch_change_nothing(adjoint):
         image_loss(out.image, photograph).backward()
         return out, {name: leaves[name].grad for name in PARAMETERS}
 
-    expected, dtype = everything(leaves[0]), torch.get_default_dtype()
+    def beside():
+        asked = RasterOptions(normals=True, median_depth=True, strongest=2), RasterOptions(bound=True)
+        outs = [warp_splat.rasterize(*scene.parameters(), scene.camera, options=options) for options in asked]
+        return [outs[0].median_depth, outs[0].strongest_weights, outs[0].normals, outs[1].image, outs[1].bound]
+
+    expected, found, dtype = everything(leaves[0]), beside(), torch.get_default_dtype()
     try:
         torch.set_default_dtype(torch.float64)
         assert equal(everything(leaves[1]), expected)
+        assert all(torch.equal(one, other) for one, other in zip(beside(), found, strict=True))
     finally:
         torch.set_default_dtype(dtype)
     with torch.device("meta"):

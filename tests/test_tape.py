@@ -290,6 +290,10 @@ def test_worlds_are_separate_calls_into_one_array(device):
         assert torch.equal(wp.to_torch(images, requires_grad=False)[world], expected.image)
         assert torch.equal(wp.to_torch(found[world].alpha, requires_grad=False), expected.alpha)
         assert torch.equal(wp.to_torch(means.grad)[world], leaf.grad)
+    with pytest.raises(InputError, match="options: expected"):
+        tape.rasterize(*arrays.values(), scene.camera, options={}, hidden_from=wp.from_torch(surface[0]))
+    with pytest.raises(InputError, match="cameras: expected a sequence"):
+        tape.rasterize_worlds(*given, cameras=scene.camera)
     wrong = {"image": r"out\['image'\]: expected .* got \[3, 3, 3\]", "depth": "some of image, alpha, got 'depth'"}
     for name, sentence in wrong.items():
         with pytest.raises(InputError, match=sentence):

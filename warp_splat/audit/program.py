@@ -97,8 +97,7 @@ class _Handler(SimpleHTTPRequestHandler):
     """Says nothing, and lets no scene be kept: the next has the same name, maybe within the same second."""
 
     def end_headers(self):
-        kept = self.path.startswith("/node_modules")
-        self.send_header("Cache-Control", "max-age=3600" if kept else "no-store")
+        self.send_header("Cache-Control", "max-age=3600" if self.path.startswith("/node_modules") else "no-store")
         super().end_headers()
 
     def log_message(self, *_):

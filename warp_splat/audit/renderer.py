@@ -3,7 +3,6 @@
 import importlib
 import multiprocessing
 import os
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -56,11 +55,7 @@ class Renderer:
             self.process = context.Process(target=_serve, args=(other, self.place), daemon=True)
             self.process.start()
             other.close()
-            try:
-                self._receive(START_LIMIT)
-            except RendererFailed:  # its process has ended, or is about to
-                self.close()
-                raise
+            self._receive(START_LIMIT)
         given = [tensor.numpy() for tensor in (*workload.gaussians, workload.background)]
         self.connection.send((given, workload.camera, None if upstream is None else upstream.numpy(), runs))
         image, gradients, same = self._receive(self.limit * runs)
@@ -74,17 +69,13 @@ class Renderer:
         return Answer(image.astype(np.float64) / (255 if eight_bit else 1), eight_bit, found, same, runs)
 
     def _receive(self, limit: float):
-        if not self.connection.poll(limit):
-            self.close()
-            raise RendererFailed(f"hangs: no answer in {limit:.0f} s")
         try:
-            found = self.connection.recv()
+            found = self.connection.recv() if self.connection.poll(limit) else f"hangs: no answer in {limit:.0f} s"
         except EOFError:
             self.process.join()
-            code = self.process.exitcode
-            self.close()
-            raise RendererFailed(f"crashes: its process ended with {code}") from None
+            found = f"crashes: its process ended with {self.process.exitcode}"
         if isinstance(found, str):
+            self.close()
             raise RendererFailed(found)
         return found
 
@@ -122,21 +113,14 @@ def _serve(connection, place: str) -> None:
     try:
         render = function_of(place)
         connection.send(())
-    except Exception as error:
-        connection.send(_phrase(error))
-        return
-    with suppress(EOFError):  # the other end is gone
         while True:
             given, camera, upstream, runs = connection.recv()
-            try:
-                runs = [_draw(render, given, camera, upstream) for _ in range(runs)]
-                connection.send((*runs[0], all(_bits(run) == _bits(runs[0]) for run in runs)))
-            except Exception as error:
-                connection.send(_phrase(error))
-
-
-def _phrase(error: Exception) -> str:
-    return f"refuses: {type(error).__name__}: {reason_of(error)}"
+            runs = [_draw(render, given, camera, upstream) for _ in range(runs)]
+            connection.send((*runs[0], all(_bits(run) == _bits(runs[0]) for run in runs)))
+    except EOFError:  # the other end is gone
+        return
+    except Exception as error:
+        connection.send(f"refuses: {type(error).__name__}: {reason_of(error)}")
 
 
 def _bits(run) -> bytes:

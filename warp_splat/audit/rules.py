@@ -139,8 +139,7 @@ def find_near(prober: Prober) -> str:
     """Which of nine depths are drawn."""
     depths = np.array([0.002, 0.007, 0.015, 0.05, 0.07, 0.15, 0.3, 0.7, 1.5])
     pixels = np.stack([np.linspace(4.5, 60.5, 9), np.full(9, 24.5)], 1)
-    cover = prober.cover(pixels, depths, 1.5, 0.9)
-    drawn = cover[24, pixels[:, 0].astype(int)] > 0.3
+    drawn = prober.cover(pixels, depths, 1.5, 0.9)[24, pixels[:, 0].astype(int)] > 0.3
     if drawn.all():
         prober.options["near"] = 1e-6
         return f"There is no near plane, down to {depths[0]}."

@@ -109,8 +109,7 @@ def differentiate_on_tape(
     workload: Workload, upstream: torch.Tensor | None = None
 ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
     """The image [H, W, 3], and the gradients by parameter for the upstream gradient [H, W, 3], or for ones."""
-    values = (*workload.gaussians[:4], workload.gaussians.sh, workload.background)
-    given = dict(zip(PARAMETERS, values, strict=False))
+    given = dict(zip(PARAMETERS, (*workload.gaussians[:4], workload.gaussians.sh, workload.background), strict=False))
     arrays = {name: wp.from_torch(tensor.clone(), requires_grad=True) for name, tensor in given.items()}
     with wp.Tape() as recorded:
         out = tape.rasterize(**arrays, camera=workload.camera, options=workload.options)

@@ -72,7 +72,7 @@ def _start(splats: SplatArrays) -> Camera:
     radius = np.percentile(np.linalg.norm(means - middle, axis=1), 80) or 1.0
     center = 0.5 * np.array(START_SIZE)
     focal = center[1] / np.tan(0.5 * START_FOV)
-    distance = radius / np.sin(0.5 * START_FOV)
+    distance = max(radius / np.sin(0.5 * START_FOV), radius + 2.0 * constants.NEAR)  # what is nearer does not show
     return Camera(*START_SIZE, focal, focal, *center, np.eye(3), np.array([0, 0, distance]) - middle)
 
 

@@ -64,8 +64,7 @@ def parts(splats: SplatArrays, origin: np.ndarray, coarse: SplatArrays | None = 
         origin: the point [3] that positions are relative to, world units.
         coarse: CHUNK others of degree 0, which become the first part.
     """
-    starts = range(0, max(1, len(splats.means)), CHUNK)
-    chunks = [splats.take(slice(start, start + CHUNK)) for start in starts]
+    chunks = [splats.take(slice(start, start + CHUNK)) for start in range(0, max(1, len(splats.means)), CHUNK)]
     if coarse is not None:
         chunks = [coarse, *chunks]
     found = {f"gaussians{index}": _compressed(_core(chunk, origin)) for index, chunk in enumerate(chunks)}

@@ -21,19 +21,26 @@ class Format(NamedTuple):
 
     load: Callable[[str | Path, Report], SplatFile]
     save: Callable[[str | Path, SplatFile, Report], None]
+    marks: tuple[str, ...]  # those of MARKS that it has room for
     along_curve: bool = False  # written in an order in which near Gaussians follow each other
     empty: bool = True  # can say that there are no Gaussians
 
 
+#: What a file may say of all its Gaussians, and how to say that it is lost.
+MARKS = {
+    "antialiased": "the mark that the Gaussians are antialiased",
+    "coordinates": "where they are in the world (coordinates.json)",
+    "linear": "that their colors are in linear light",
+}
+BOTH = ("antialiased", "coordinates")
 FORMATS = {
-    ".ply": Format(load_ply, save_ply),
-    ".compressed.ply": Format(load_ply, save_compressed_ply, along_curve=True),
-    ".splat": Format(load_splat, save_splat, empty=False),
-    ".spz": Format(load_spz, save_spz),
-    ".sog": Format(load_sog, save_sog, along_curve=True, empty=False),
-    ".glb": Format(load_gltf, save_gltf, empty=False),
-    ".gltf": Format(load_gltf, save_gltf, empty=False),
-    **dict.fromkeys((".usd", ".usda", ".usdc", ".usdz"), Format(load_usd, save_usd)),
+    ".ply": Format(load_ply, save_ply, BOTH),
+    ".compressed.ply": Format(load_ply, save_compressed_ply, BOTH, along_curve=True),
+    ".splat": Format(load_splat, save_splat, (), empty=False),
+    ".spz": Format(load_spz, save_spz, BOTH[:1]),
+    ".sog": Format(load_sog, save_sog, BOTH[:1], along_curve=True, empty=False),
+    **dict.fromkeys((".glb", ".gltf"), Format(load_gltf, save_gltf, tuple(MARKS), empty=False)),
+    **dict.fromkeys((".usd", ".usda", ".usdc", ".usdz"), Format(load_usd, save_usd, BOTH)),
 }
 
 
@@ -51,7 +58,7 @@ def format_of(path: str | Path) -> Format:
 
 
 def load_gaussians(path: str | Path, report: Report = print) -> SplatFile:
-    """Read Gaussians of any format, in the frame of their training; those with a value that is not finite are left out.
+    """Read Gaussians of any format, in the frame of their training, but those not finite and those without a rotation.
 
     Args:
         path: a file of one of FORMATS.
@@ -69,8 +76,8 @@ def save_gaussians(path: str | Path, file: SplatFile, report: Report = print) ->
 
     Args:
         path: the file to write.
-        file: the Gaussians, finite.
-        report: called with a part of a sentence for each kind of value that the format cannot hold.
+        file: the Gaussians, finite and with rotations.
+        report: called with a part of a sentence for each kind of value that the format cannot hold, and each of MARKS.
 
     Returns:
         The Gaussians in the order in which they were written.
@@ -88,4 +95,7 @@ def save_gaussians(path: str | Path, file: SplatFile, report: Report = print) ->
 
         file = file._replace(splats=arranged(file.splats))
     form.save(path, file, report)
+    for mark, lost in MARKS.items():
+        if getattr(file, mark) and mark not in form.marks:
+            report(lost)
     return file

@@ -25,7 +25,7 @@ from warp_splat.text import Report
 NAME = "KHR_gaussian_splatting"
 AXES = "LUF"
 UNDERSTOOD = {NAME, "KHR_mesh_quantization"}  # extensions that a file may require
-COLOR_SPACE = "srgb_rec709_display"  # that of the photographs
+COLOR_SPACES = ("srgb_rec709_display", "lin_rec709_display")  # as photographs have it; in linear light
 RENDER_MODE = "SplatRenderMode"
 COORDINATES = "coordinates"
 MOST_PIECES = 4096  # meshes; the Gaussians of a scene are one or a few
@@ -48,9 +48,9 @@ def save_gltf(path: str | Path, file: SplatFile, report: Report = print) -> None
         InputError: if a file cannot be written, or is too large for its kind.
     """
     path = Path(path)
-    attributes = _attributes(turned(file.splats, frame(AXES).T), report)
+    attributes = _attributes(turned(file.splats, frame(AXES).T), file.linear, report)
     data = b"".join(array.tobytes() for array in attributes.values())
-    document = _describe(attributes, file.antialiased)
+    document = _describe(attributes, file)
     if coordinates := kept(file.coordinates, "x west, y up, z north"):
         document["extras"] = {COORDINATES: coordinates}
     if path.suffix.lower() == ".gltf":
@@ -99,15 +99,17 @@ def load_gltf(path: str | Path, report: Report = print) -> SplatFile:
             parts.append(turned(splats, frame(AXES) @ turn, frame(AXES) @ translation, scale))
     for note in dict.fromkeys(notes):
         report(f"{path}: {note}.")
-    antialiased = all(_extra(piece["extensions"][NAME], RENDER_MODE) == "mip" for piece, _ in placed)
-    return SplatFile(concatenated(parts), antialiased, kept(_extra(document.json, COORDINATES)))
+    told = [piece["extensions"][NAME] for piece, _ in placed]
+    antialiased = all(_extra(extension, RENDER_MODE) == "mip" for extension in told)
+    linear = all(extension.get("colorSpace") == COLOR_SPACES[1] for extension in told)
+    return SplatFile(concatenated(parts), antialiased, kept(_extra(document.json, COORDINATES)), linear)
 
 
-def _attributes(splats: SplatArrays, report: Report) -> dict[str, np.ndarray]:
+def _attributes(splats: SplatArrays, in_linear: bool, report: Report) -> dict[str, np.ndarray]:
     means, sh, opacities, scales, quats = splats
     opacity = sigmoid(opacities)
     shown = np.clip(SH_C0 * sh[:, 0] + 0.5, 0, 1)
-    linear = from_srgb(shown, np.where)  # as COLOR_0 is
+    linear = shown if in_linear else from_srgb(shown, np.where)  # as COLOR_0 is
     attributes = {
         "POSITION": means,
         "COLOR_0": np.rint(255 * np.concatenate([linear, opacity[:, None]], axis=1)),
@@ -124,7 +126,7 @@ def _harmonic_names(coefficients: int) -> list[str]:
     return [f"{NAME}:SH_DEGREE_{degree}_COEF_{order}" for degree in degrees for order in range(2 * degree + 1)]
 
 
-def _describe(attributes: dict[str, np.ndarray], antialiased: bool) -> dict:
+def _describe(attributes: dict[str, np.ndarray], file: SplatFile) -> dict:
     """The JSON of a file whose buffer holds the attributes one after the other."""
     views, accessors, offset = [], [], 0
     for index, (name, array) in enumerate(attributes.items()):
@@ -135,8 +137,8 @@ def _describe(attributes: dict[str, np.ndarray], antialiased: bool) -> dict:
         accessors.append({"bufferView": index, "count": len(array), "type": kind, **component})
         if name == "POSITION":
             accessors[-1] |= {"min": array.min(axis=0).tolist(), "max": array.max(axis=0).tolist()}
-    extension: dict = {"kernel": "ellipse", "colorSpace": COLOR_SPACE}
-    if antialiased:
+    extension: dict = {"kernel": "ellipse", "colorSpace": COLOR_SPACES[file.linear]}
+    if file.antialiased:
         extension["extras"] = {RENDER_MODE: "mip"}
     indices = {name: index for index, name in enumerate(attributes)}
     return {
@@ -161,11 +163,11 @@ def _read_primitive(document: Document, primitive: dict, report: Report) -> Spla
     extension, attributes = primitive["extensions"][NAME], primitive.get("attributes")
     if not isinstance(extension, dict) or not isinstance(attributes, dict):
         raise Unexpected("a primitive without attributes")
-    kernel, space = extension.get("kernel", "ellipse"), extension.get("colorSpace", COLOR_SPACE)
+    kernel, space = extension.get("kernel", "ellipse"), extension.get("colorSpace", COLOR_SPACES[0])
     if kernel != "ellipse" or extension.get("extensions"):
         raise Unexpected(f"Gaussians of kernel {kernel!r:.40} or in a compressed form; export them without extensions")
-    if space != COLOR_SPACE:
-        report(f"the colors are in {space!r:.40} and are kept as they are; expected {COLOR_SPACE!r}")
+    if space not in COLOR_SPACES:
+        report(f"the colors are in {space!r:.40} and are kept as they are; expected {COLOR_SPACES[0]!r}")
     coefficients = sum(name.startswith(f"{NAME}:SH_DEGREE_") for name in attributes)
     if coefficients not in COEFFICIENTS:
         raise Unexpected(f"a primitive with {coefficients} coefficients of SH, not 1, 4, 9 or 16")

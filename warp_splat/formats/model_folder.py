@@ -17,6 +17,7 @@ import numpy as np
 
 from warp_splat.camera import Camera
 from warp_splat.errors import InputError, refusing
+from warp_splat.formats.coordinates import read_coordinates
 from warp_splat.formats.exchange import FORMATS, load_gaussians
 from warp_splat.formats.files import T, Unexpected, read_json, write_text
 from warp_splat.formats.splats import SplatFile, cropped
@@ -134,21 +135,21 @@ def open_model(path: str | Path, iteration: int = -1, crop: Sequence[float] = ()
     """The iteration, the Gaussians and the options of the training, from a model folder or a file of Gaussians.
 
     Of a file, the iteration is 0. Where there is no cfg_args, the options are that every 8th view was held out, and
-    the antialiasing that the file tells. ``crop`` as :func:`warp_splat.formats.splats.cropped` takes it.
+    what the file tells. ``crop`` as :func:`warp_splat.formats.splats.cropped` takes it.
 
     Raises:
         InputError: if there is no such model, or it cannot be read.
     """
     path, options = Path(path), {"eval": True}
     if is_file_of_gaussians(path):
-        iteration, file = 0, path
+        iteration, found = 0, load_gaussians(path)
     else:
         iteration = find_iteration(path, iteration)
-        file = ply_path(path, iteration)
+        found = load_gaussians(ply_path(path, iteration))._replace(coordinates=read_coordinates(path))
         options = read_cfg_args(path) if (path / "cfg_args").exists() else options
-    gaussians = load_gaussians(file)
-    gaussians = gaussians._replace(splats=cropped(gaussians.splats, crop))
-    return iteration, gaussians, {"antialiasing": gaussians.antialiased, **options}
+    options = {"antialiasing": found.antialiased, "linear_light": found.linear, **options}
+    marks = {"antialiased": bool(options["antialiasing"]), "linear": bool(options["linear_light"])}
+    return iteration, found._replace(splats=cropped(found.splats, crop), **marks), options
 
 
 def write_cfg_args(folder: str | Path, namespace: Mapping[str, object]) -> None:

@@ -38,8 +38,7 @@ def codebook(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             members = np.diff(ahead[edges])
             entries = np.where(members > 0, np.diff(sums[edges]) / np.maximum(members, 1), entries)
     entries = entries.astype(np.float32)
-    middles = 0.5 * (entries[1:].astype(np.float64) + entries[:-1])
-    return entries, np.searchsorted(middles, values).astype(np.uint8)
+    return entries, np.searchsorted(0.5 * (entries[1:].astype(np.float64) + entries[:-1]), values).astype(np.uint8)
 
 
 def palette(vectors: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:

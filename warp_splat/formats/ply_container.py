@@ -30,8 +30,7 @@ def write_tables(path: str | Path, tables: Mapping[str, np.ndarray], comments: S
     Raises:
         InputError: if the file cannot be written.
     """
-    sizes = {name: (len(rows), rows.dtype) for name, rows in tables.items()}
-    write_parts(path, sizes, tables.values(), comments)
+    write_parts(path, {name: (len(rows), rows.dtype) for name, rows in tables.items()}, tables.values(), comments)
 
 
 def write_parts(

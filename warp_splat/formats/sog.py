@@ -234,8 +234,7 @@ def _listed(entries: np.ndarray) -> list[float]:
 def _pack_quats(quats: np.ndarray) -> np.ndarray:
     """Rotations as bytes [N, 4]: the three smallest of w x y z, and which is left out."""
     largest, others = smallest_three(quats)
-    packed = np.clip(np.rint(255 * (others + 0.5)), 0, 255)
-    return np.column_stack([packed, TAG + largest]).astype(np.uint8)
+    return np.column_stack([np.clip(np.rint(255 * (others + 0.5)), 0, 255), TAG + largest]).astype(np.uint8)
 
 
 def _unpack_quats(rows: np.ndarray) -> np.ndarray:

@@ -41,6 +41,7 @@ class SplatFile(NamedTuple):
     splats: SplatArrays
     antialiased: bool = False  # trained, and to be rendered, with the opacities of Mip-Splatting (Yu et al. 2024)
     coordinates: dict | None = None  # where in the world they are (formats/coordinates.py)
+    linear: bool = False  # colors in linear light, not as a screen shows them
 
 
 def check_shapes(splats: SplatArrays) -> None:
@@ -56,12 +57,18 @@ def check_shapes(splats: SplatArrays) -> None:
 
 
 def finite_rows(splats: SplatArrays, path, report: Report) -> SplatArrays:
-    """Leave out Gaussians with a value that is not finite, since one can spoil a whole image; ``report`` says so."""
+    """Leave out Gaussians with a value that is not finite, or a quaternion of zero; ``report`` says so.
+
+    One of the first can spoil a whole image. The others would be in none, but formats store them as the identity.
+    """
     count = len(splats.means)
     finite = np.all([np.isfinite(array).all(axis=tuple(range(1, array.ndim))) for array in splats], axis=0)
+    finite &= splats.quats.any(axis=1)
     if finite.all():
         return splats
-    report(f"{path}: left out {np.count_nonzero(~finite)} of {count} Gaussians with values that are not finite.")
+    report(
+        f"{path}: left out {np.count_nonzero(~finite)} of {count} Gaussians that are not finite or have no rotation."
+    )
     return splats.take(finite)
 
 

@@ -29,7 +29,7 @@ def log_scales(scales: np.ndarray) -> np.ndarray:
 
 
 def unit_quats(quats: np.ndarray) -> np.ndarray:
-    """Quaternions of unit length, w x y z; the identity for those of no length, as the renderer takes them."""
+    """Quaternions of unit length, w x y z; the identity for those of no length."""
     quats = quats.astype(np.float64)
     norms = np.linalg.norm(quats, axis=1, keepdims=True)
     return np.where(norms > 0, quats / np.where(norms > 0, norms, 1), [1.0, 0.0, 0.0, 0.0]).astype(np.float32)

@@ -130,8 +130,7 @@ class Lens:
 def _ray(bent: np.ndarray) -> np.ndarray:
     """Unit directions [..., 3] of angles from the axis, along x and y [..., 2]."""
     angle = np.hypot(bent[..., 0], bent[..., 1])
-    across = bent * np.sinc(angle / math.pi)[..., None]
-    return np.concatenate([across, np.cos(angle)[..., None]], -1)
+    return np.concatenate([bent * np.sinc(angle / math.pi)[..., None], np.cos(angle)[..., None]], -1)
 
 
 @functools.lru_cache(maxsize=1024)

@@ -205,8 +205,7 @@ class SensorSplatCamera:
         """Without gradients: views of one camera in a row at once; from one place, what is shared once."""
         shared, keys = self._pieces[-1], [(id(camera),) for camera in cameras]
         if shared and mesh_depth is None:
-            poses = camera_transforms.numpy().tolist()
-            eyes = [(*key, *pose) for key, pose in zip(keys, poses, strict=True)]
+            eyes = [(*key, *pose) for key, pose in zip(keys, camera_transforms.numpy().tolist(), strict=True)]
             same = [before == eye for before, eye in pairwise([None, *eyes, None])]
             keys = [eye if same[view] or same[view + 1] else keys[view] for view, eye in enumerate(eyes)]
         for key, group in groupby(range(len(keys)), keys.__getitem__):

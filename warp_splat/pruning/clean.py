@@ -43,7 +43,7 @@ def clean(config: CleanConfig) -> int:
         trained = {**opened.trained, "parts": ",".join(sorted(parts))}
         left = file._replace(splats=splats)
         splats = tuned(opened.scene, left, opened.setting, len(splats.means), config.steps, trained)
-    write(output, file, splats)
+    write(output, opened, splats)
     print_quality(opened.quality(before), opened.quality(splats))
     sheet = output.with_suffix(".sheet.png")
     _draw(opened, before, splats, sheet)

@@ -40,8 +40,6 @@ class Opened(Finished):
         super().__init__(config.model, config.iteration, config.crop)
         require_some(self)
         self.scene = self.refined(self.load_scene(config.source_path, print))
-        if self.harmonics is not None:
-            print(f"What {self.path} has learned behind its Gaussians stays. A file of Gaussians does not have it.")
         if config.crop:
             train, test = (self._within(views, used) for views in (self.scene.train, self.scene.test))
             if not train:
@@ -105,15 +103,15 @@ def written_bytes(name: Path, file: SplatFile) -> int:
         return sum(path.stat().st_size for path in Path(folder).iterdir())
 
 
-def write(path: Path, before: SplatFile, splats: SplatArrays) -> None:
-    """Write ``splats`` in place of those of ``before``, and print what that saved."""
-    notes: list[str] = []
+def write(path: Path, finished: Finished, splats: SplatArrays) -> None:
+    """Write ``splats`` in place of those of a model, and print what that saved, and lost."""
+    before, notes = finished.file, finished.beyond_files
     after = before._replace(splats=splats)
     save_gaussians(path, after, notes.append)
     old, new = written_bytes(path, before), written_bytes(path, after)
     print(f"{path}: {len(splats.means)} of {len(before.splats.means)} Gaussians, {new / 1e6:.2f} of {old / 1e6:.2f} MB")
     if notes:
-        print(f"  the format lost: {'; '.join(notes)}")
+        print(f"  lost: {'; '.join(notes)}")
 
 
 def print_quality(before: dict[str, float], after: dict[str, float]) -> None:

@@ -84,8 +84,7 @@ def costs(model: GaussianModel, setting: ViewSetting) -> Costs:
     harmonics = torch.zeros(len(model), degrees, dtype=torch.float64, device=model.device)
     for number, view in enumerate(setting.views):
         generator, size = torch.Generator().manual_seed(number), (view.camera.height, view.camera.width, 3)
-        signs = 2.0 * torch.randint(0, 2, size, generator=generator) - 1.0
-        found = carried(gaussians, view, setting, signs)
+        found = carried(gaussians, view, setting, 2.0 * torch.randint(0, 2, size, generator=generator) - 1.0)
         whole += (found.adj_opacities.double() * found.splats.opacities.detach()) ** 2
         squares = (found.adj_colors.double() ** 2).mean(1)
         for degree in range(degrees):

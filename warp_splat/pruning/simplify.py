@@ -64,7 +64,7 @@ def simplify(config: SimplifyConfig) -> int:
     splats = made(count)
     if not config.tolerance:
         splats = fewer_harmonics(splats, opened.setting, squared_error(opened, splats))
-    write(output, file, splats)
+    write(output, opened, splats)
     if config.tolerance:
         measured, bound = changed(splats)
         found = f"{measured:.2g} measured, {upward(bound)} its bound"
@@ -81,8 +81,7 @@ def simplify(config: SimplifyConfig) -> int:
 def degrees_of(splats: SplatArrays) -> np.ndarray:
     """The highest degree of each Gaussian that is not zero [N]."""
     used = np.any(splats.sh != 0, axis=2)
-    highest = np.where(used, np.arange(used.shape[1]), 0).max(axis=1)
-    return np.searchsorted(COEFFICIENTS, highest, side="right")
+    return np.searchsorted(COEFFICIENTS, np.where(used, np.arange(used.shape[1]), 0).max(axis=1), side="right")
 
 
 def bytes_of(size: str) -> int:
@@ -192,5 +191,5 @@ def _unseen(config: SimplifyConfig, output: Path) -> int:
     order = np.argsort(-sizes(file.splats), kind="stable")
     keep = lambda count: file.splats.take(np.sort(order[:count]))  # noqa: E731
     count = _count(config, len(order), lambda count: written_bytes(output, file._replace(splats=keep(count))))
-    write(output, file, keep(count))
+    write(output, finished, keep(count))
     return 0

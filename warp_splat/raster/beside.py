@@ -86,7 +86,7 @@ def find_strongest(splats: Splats2D, blending: Blending) -> tuple[torch.Tensor, 
     bins, camera, options = blending.bins, blending.camera, blending.options
     shape, most, device = (camera.height, camera.width), options.strongest, splats.means2d.device
     ranks = torch.empty(*shape, most, dtype=torch.int32, device=device)
-    weights = torch.empty(*shape, most, device=device)
+    weights = torch.empty(*shape, most, dtype=torch.float32, device=device)
     median = torch.empty(shape, dtype=torch.int32, device=device)
     _launch(blending, weights, Group(0, 0, weights.new_empty(0, 0)), (ranks, median))
     gaussians, middle = _gaussians_of(bins, camera, ranks), _gaussians_of(bins, camera, median[..., None])
@@ -133,7 +133,7 @@ def normals_of(gaussians: Gaussians, away: torch.Tensor) -> torch.Tensor:
 
 def rays(camera: Camera, device: torch.device) -> torch.Tensor:
     """Of a pinhole's pixels, in the world, from its center to depth 1, [H, W, 3]."""
-    columns, rows = torch.arange(camera.width, device=device), torch.arange(camera.height, device=device)
+    columns, rows = (torch.arange(n, dtype=torch.float32, device=device) for n in (camera.width, camera.height))
     y, x = torch.meshgrid((rows + 0.5 - camera.cy) / camera.fy, (columns + 0.5 - camera.cx) / camera.fx, indexing="ij")
     return torch.stack([x * right + y * down + forward for right, down, forward in camera.rotation.T.tolist()], -1)
 

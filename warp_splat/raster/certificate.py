@@ -104,7 +104,7 @@ def certify(
         rows, columns = 4 * -(-camera.height // TILE), 4 * -(-camera.width // TILE)
         new = {"dtype": torch.int32, "device": device}
         maps = torch.zeros(len(bounds) - 1 if threads else 1, len(begins), rows + 1, columns + 1, **new)
-        starts, bands = torch.tensor(begins, device=device), torch.tensor(bounds, **new)
+        starts, bands = colors.new_tensor(begins), torch.tensor(bounds, **new)
         extents, radii = torch.empty_like(splats.extents), torch.empty_like(splats.radii)
         if count:
             inputs = [view(bands, wp.int32), splats.view(), view(scales, wp.vec3), rules, view(starts, wp.float32)]
@@ -125,7 +125,7 @@ def certify(
         "unknown": float(lost),
         "floor": wp.vec2((1.0 - BAND) * ALPHA_MIN, SURE) if rules.floor else wp.vec2(faint),
     }
-    bound, rounding = (torch.empty(camera.height, camera.width, device=device) for _ in range(2))
+    bound, rounding = (colors.new_empty(camera.height, camera.width) for _ in range(2))
     return splats._replace(extents=extents, radii=radii), Certificate(bound, rounding, errors, fields)
 
 
@@ -134,7 +134,7 @@ def _color_errors(gaussians: Gaussians, options: RasterOptions, brightest: float
 
     A band of degree l is at most sqrt((2 l + 1) / 4 pi) times the norm of its coefficients.
     """
-    errors = torch.empty(max(len(gaussians.means), 1), 3, device=gaussians.means.device)
+    errors = gaussians.means.new_empty(max(len(gaussians.means), 1), 3)
     errors[:, 2] = ROUNDED_COLORS * brightest
     rest = gaussians.sh_rest.detach()
     for degree, (low, high) in enumerate(((0, 3), (3, 8), (8, 15)), 1):

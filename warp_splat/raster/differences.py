@@ -125,8 +125,7 @@ class MovableScene:
             return self._stack(self._render(self.inputs | {name: moved})).double()
         key = "opacities" if name == "opacities2d" else name
         extents = (self.splats.extents * _growth(self, name, step)).float()
-        splats = self.splats._replace(extents=extents, **{key: moved})
-        return self._stack(self._render(self.inputs, splats)).double()
+        return self._stack(self._render(self.inputs, self.splats._replace(extents=extents, **{key: moved}))).double()
 
     def _render(self, inputs: dict[str, torch.Tensor], splats: Splats2D | None = None) -> RenderOutput:
         given = _gaussians(inputs), put_together(self.camera, inputs), inputs["background"]
@@ -229,8 +228,7 @@ def _extrapolate(scene: MovableScene, rung: int, far: tuple, near: tuple) -> Quo
     base = scene.picture.detach().double()
     largest, h = max(float(base.abs().max()), 1.0), LEAST * 2.0**rung
     odd = (plus - minus) - 2 * (near_plus - near_minus)
-    even = (plus + minus) - 4 * (near_plus + near_minus) + 6 * base
-    kept = _is_smooth(odd, largest) & _is_smooth(even, largest)
+    kept = _is_smooth(odd, largest) & _is_smooth((plus + minus) - 4 * (near_plus + near_minus) + 6 * base, largest)
     moved = ((plus != base) | (minus != base)).any(2)
     pixels = int((kept & moved).sum()) / int(moved.sum()) if moved.any() else 1.0
     spread, quotient = odd[kept] / (2 * h), (near_plus - near_minus)[kept] / h

@@ -62,8 +62,7 @@ def focus_point(scene: Scene) -> tuple[np.ndarray, np.ndarray, float]:
     across = [np.eye(3) - np.outer(camera.forward, camera.forward) for camera in cameras]
     wanted = sum(a @ camera.center for a, camera in zip(across, cameras, strict=True))
     center = np.linalg.lstsq(sum(across), wanted, rcond=None)[0]
-    distance = float(np.mean([np.linalg.norm(camera.center - center) for camera in cameras]))
-    return center, scene.up, distance
+    return center, scene.up, float(np.mean([np.linalg.norm(camera.center - center) for camera in cameras]))
 
 
 def focus_orbit(scene: Scene, count: int, lens: Camera = ORBIT_LENS) -> list[Camera]:

@@ -13,10 +13,9 @@ import torch
 from warp_splat.camera import Camera
 from warp_splat.config import ConvertConfig, RasterOptions
 from warp_splat.errors import InputError
-from warp_splat.formats.coordinates import read_coordinates
 from warp_splat.formats.exchange import format_of, load_gaussians, save_gaussians
-from warp_splat.formats.model_folder import is_file_of_gaussians, open_model, ply_path, read_environment
-from warp_splat.formats.splats import COEFFICIENTS, SplatArrays, SplatFile
+from warp_splat.formats.model_folder import is_file_of_gaussians, ply_path
+from warp_splat.formats.splats import COEFFICIENTS, SplatArrays
 from warp_splat.formats.stored import LOG_SCALES, SH_C0, sigmoid, unit_quats
 from warp_splat.gaussians import GaussianModel
 from warp_splat.raster.api import render
@@ -37,41 +36,36 @@ def convert(config: ConvertConfig) -> int:
         InputError: if a name has an unknown ending, the source cannot be read, or the target cannot be written.
     """
     format_of(config.target)  # before anything is read
-    iteration, before, trained = open_model(config.source, crop=config.crop)
-    source = config.source if is_file_of_gaussians(config.source) else ply_path(config.source, iteration)
+    finished = Finished(config.source, crop=config.crop)
+    source = config.source if is_file_of_gaussians(config.source) else ply_path(config.source, finished.iteration)
     if os.path.exists(config.target) and os.path.samefile(source, config.target):
         raise InputError(f"{config.target}: expected another file than the source; name a new one.")
-    where = before.coordinates if is_file_of_gaussians(config.source) else read_coordinates(config.source)
-    before = before._replace(antialiased=bool(trained["antialiasing"]), coordinates=where)
     notes: list[str] = []
-    before = save_gaussians(config.target, before, notes.append)
-    after = load_gaussians(config.target)
-    degree = COEFFICIENTS.index(after.splats.sh.shape[1])
-    print(f"{config.target}: {len(after.splats.means)} Gaussians, SH degree {degree}")
-    notes = losses(before, after) + notes
-    if read_environment(config.source, iteration) is not None:
-        notes.append("what was learned behind the Gaussians (--parts sky), which no format has")
+    before = save_gaussians(config.target, finished.file, notes.append).splats
+    after = load_gaussians(config.target).splats
+    print(f"{config.target}: {len(after.means)} Gaussians, SH degree {COEFFICIENTS.index(after.sh.shape[1])}")
+    notes = losses(before, after) + notes + finished.beyond_files
     print(f"  lost: {'; '.join(notes)}" if notes else "  nothing lost but rounding of float32")
-    if config.bound:
-        _compare(config)
+    if config.bound and len(before.means):
+        _compare(before, after, finished.options)
     return 0
 
 
-def _compare(config: ConvertConfig) -> None:
-    """Tell how much pictures of source and target differ."""
+def _compare(before: SplatArrays, after: SplatArrays, options: RasterOptions) -> None:
+    """Tell how much pictures of two sets of Gaussians differ, of which the first has some."""
     launch.prepare("cpu", 0)
-    finished = Finished(config.source, crop=config.crop)
-    splats = (finished.file.splats, load_gaussians(config.target).splats)
-    means = np.asarray(splats[0].means if len(splats[0].means) else [[0, 0, 0]], np.float64)
+    means = before.means.astype(np.float64)
     middle = np.median(means, axis=0)
-    reach = np.quantile(np.linalg.norm(means - middle, axis=1), 0.75)
+    size = np.exp(np.median(np.clip(before.scales.max(1), *LOG_SCALES)))  # if all are at one place
+    reach = max(np.quantile(np.linalg.norm(means - middle, axis=1), 0.75), size)
     radius = DISTANCE * reach + 1e-6 * (1 + np.abs(middle).max())
+    options = replace(options, near=min(options.near, 0.1 * radius))  # or small models would not show
     start, up = middle - [0.0, 0.0, radius], np.array([0.0, -1.0, 0.0])
     lens = ORBIT_LENS.resized(ORBIT_LENS.width // 3, ORBIT_LENS.height // 3)
     cameras = orbit_cameras(middle, up, start, AROUND, lens)
     with torch.no_grad():
-        before, after = (GaussianModel.from_splats(some).arranged().activated() for some in splats)
-    measured, bound = largest_change(before, after, cameras, torch.zeros(3), finished.options)
+        models = [GaussianModel.from_splats(some).arranged().activated() for some in (before, after)]
+    measured, bound = largest_change(*models, cameras, torch.zeros(3), options)
     print(f"  largest change of a pixel, {AROUND} places around: {measured:.2g} measured, {upward(bound)} its bound")
 
 
@@ -93,17 +87,12 @@ def largest_change(
     return measured, bound
 
 
-def losses(before: SplatFile, after: SplatFile) -> list[str]:
+def losses(old: SplatArrays, new: SplatArrays) -> list[str]:
     """What differs, in phrases with numbers: the largest change of any Gaussian and the root mean square."""
     notes = []
-    old, new = before.splats, after.splats
     degrees = [COEFFICIENTS.index(splats.sh.shape[1]) for splats in (old, new)]
     if degrees[0] != degrees[1]:
         notes.append(f"SH degree {degrees[0]} became {degrees[1]}")
-    if before.antialiased != after.antialiased:
-        notes.append("the mark that the Gaussians are antialiased")
-    if before.coordinates and not after.coordinates:
-        notes.append("where they are in the world (coordinates.json)")
     if len(old.means) != len(new.means):
         return [*notes, f"{len(old.means) - len(new.means)} of {len(old.means)} Gaussians"]
     for name, unit, size, change in _changes(old, new):

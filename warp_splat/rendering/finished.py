@@ -55,6 +55,16 @@ class Finished:
         projection = self.trained.get("projection")
         return replace(found, projection=projection) if projection in PROJECTIONS else found
 
+    @property
+    def beyond_files(self) -> list[str]:
+        """What its pictures owe to the training, and no file of Gaussians says."""
+        owed = {
+            "what was learned behind the Gaussians (--parts sky)": self.harmonics is not None,
+            "that a white background was behind them": bool(self.trained.get("white_background")),
+            f"their projection ({self.options.projection})": self.options.projection != RasterOptions().projection,
+        }
+        return [f"{what}, which no format has" for what, owes in owed.items() if owes]
+
     def is_linear(self, scene: Scene | None) -> bool:
         """Whether its colors are in linear light: those of its scene, or else what its training says."""
         return scene.linear if scene else bool(self.trained.get("linear_light"))

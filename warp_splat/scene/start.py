@@ -35,8 +35,7 @@ def random_points(cameras: list[Camera]) -> tuple[np.ndarray, np.ndarray]:
     for _ in range(ROUNDS):
         drawn = _along_rays(cameras, extent, random)
         if len(cameras) > 1:
-            seen = sum(visible(camera, drawn).astype(int) for camera in cameras)
-            drawn = drawn[seen >= 2]
+            drawn = drawn[sum(visible(camera, drawn).astype(int) for camera in cameras) >= 2]
         kept.append(drawn)
         if sum(map(len, kept)) >= COUNT:
             break

@@ -21,6 +21,7 @@ LOOSE = 0.05  # of the positions' extent: what RANSAC takes for right
 OUTLIER = 3.0  # standard deviations, as the median of the residuals tells them
 COARSE = 0.1  # of the extent: GPS that errs by more is not taken
 USUAL = 5.0  # units: half of what photographs show is farther away, where nothing tells the scale
+TURNED = 0.7  # cosine: of where photographs have their top, or look, against up
 LINE = 0.1  # share of the extent that positions leave a straight line by, below which they do not tell up
 
 
@@ -43,8 +44,8 @@ def georeference(model: pycolmap.Reconstruction, database: Path, source: str, se
     """
     images = {image.name: image for image in map(model.image, model.reg_image_ids())}
     centers = {name: image.projection_center() for name, image in images.items()}
-    down = [image.cam_from_world().rotation.matrix()[1] for image in images.values()]
-    up = -np.mean(down, axis=0) / np.linalg.norm(np.mean(down, axis=0))
+    axes = np.mean([image.cam_from_world().rotation.matrix() for image in images.values()], axis=0)
+    up = -axes[1] / np.linalg.norm(axes[1])
     if source == "none":
         return None
     if source != "auto":
@@ -70,10 +71,15 @@ def georeference(model: pycolmap.Reconstruction, database: Path, source: str, se
     fitted, residuals, right = fit(np.array([centers[name] for name in names]), world - origin, up, seed)
     extent = _extent(world[right])
     error = float(np.median(residuals[right])) if right.any() else np.inf
+    tops, ahead = np.stack([up, axes[2]]) @ fitted.rotation.matrix()[2]
+    text = ""
     if right.sum() < max(LEAST, len(names) / 2) or error > COARSE * extent:
         text = f"{right.sum()} of {len(names)} fit within {error:.2g} m, where they span {extent:.3g} m"
-        if source != "auto":
-            raise InputError(f"{source}: expected positions that fit the cameras, but {text}; check names and axes.")
+    elif tops < -TURNED or (tops < TURNED and ahead > TURNED):
+        text = "photographs would stand upside down, or look at the sky, as if x and y were exchanged"
+    if text and source != "auto":
+        raise InputError(f"{source}: expected positions that fit the cameras, but {text}; check names and axes.")
+    if text:
         say(f"no coordinates, since positions do not fit the cameras: {text}")
         return None
     _move(model, fitted)
@@ -112,7 +118,7 @@ def fit(
         apart = [np.linalg.norm(each - np.roll(each, len(each) // 2, axis=0), axis=1) for each in pairs]
         lift, scale = _extent(centers), np.median(apart[1] / np.maximum(apart[0], 1e-9))
         pairs = np.concatenate([centers, centers + lift * up]), np.concatenate([world, world + scale * lift * UP])
-    options = pycolmap.RANSACOptions(max_error=LOOSE * _extent(world), random_seed=seed)
+    options = pycolmap.RANSACOptions(max_error=LOOSE * _extent(world) or 1.0, random_seed=seed)
     found = pycolmap.estimate_sim3d_robust(*pairs, options)
     right = np.asarray(found["inlier_mask"]) if isinstance(found, dict) else np.ones(len(pairs[0]), bool)
     fitted, residuals = pycolmap.Sim3d(), np.zeros(len(pairs[0]))
@@ -164,7 +170,9 @@ def _gps(database: Path) -> tuple[dict[str, np.ndarray], str]:
     if not found:
         return {}, ""
     places, zone = pycolmap.GPSTransform().ellipsoid_to_utm(list(found.values()))
-    south = np.mean([place[0] for place in found.values()]) < 0
+    latitudes = np.array([place[0] for place in found.values()])
+    south, places = latitudes.mean() < 0, np.array(places)
+    places[:, 1] += 1e7 * (float(south) - (latitudes < 0))  # south of the equator, 10,000 km come on top
     return dict(zip(found, places, strict=True)), f"UTM zone {zone} {'south' if south else 'north'}, WGS 84, from GPS"
 
 
@@ -172,7 +180,7 @@ def read_places(path: Path) -> tuple[list[str], list[tuple[list[str], list[float
     """The first line of a CSV file, and of the others the names and the numbers."""
     with reading(path, f"a CSV file that begins with {','.join(POSITIONS)} or {','.join(DISTANCES)}"):
         with path.open(newline="", encoding="utf-8-sig") as file:
-            first, *rows = [[cell.strip() for cell in row] for row in csv.reader(file) if row]
+            first, *rows = [[cell.strip() for cell in row] for row in csv.reader(file) if "".join(row).strip()]
         if first not in (POSITIONS, DISTANCES):
             raise Unexpected(f"{','.join(first):.80}")
         text = 1 if first == POSITIONS else 2
@@ -183,4 +191,7 @@ def read_places(path: Path) -> tuple[list[str], list[tuple[list[str], list[float
         for row, (_, numbers) in zip(rows, found, strict=True):
             if len(row) != len(first) or not np.isfinite(numbers).all():
                 raise Unexpected(f"the line {','.join(row):.80}")
+        named = [names[0] for names, _ in found if first == POSITIONS]
+        if twice := {name for name in named if named.count(name) > 1}:
+            raise Unexpected(f"more than one line for {few(sorted(twice)):.200}")
         return first, found

@@ -66,8 +66,7 @@ def train_steps(trainer: Trainer, run: Run, interrupted: list[int], viewer: "Tra
     if report.profile and unprofiled:
         steps = (run.iteration - unprofiled[0]) // processes.images
         times = {name: 1e3 * seconds / steps for name, seconds in stages.items()}
-        step = 1e3 * (run.seconds - unprofiled[1]) / steps
-        run.stages = {**times, "host": max(step - sum(times.values()), 0.0)}
+        run.stages = {**times, "host": max(1e3 * (run.seconds - unprofiled[1]) / steps - sum(times.values()), 0.0)}
 
 
 def _do_what_is_due(trainer: Trainer, run: Run, interrupted: list[int], bar: tqdm) -> bool:

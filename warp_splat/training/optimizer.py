@@ -126,8 +126,7 @@ class Optimizer:
         for name in self.parts:
             rate = self.tables[name].part_rate
             rates[name] = rate(iteration) if callable(rate) else rate
-        cooldown = int(min(options.cooldown, options.end))
-        late = power(0.1, max(iteration - options.falls_from, 0), max(cooldown, 1))
+        late = power(0.1, max(iteration - options.falls_from, 0), max(int(min(options.cooldown, options.end)), 1))
         for name, rate in rates.items():
             self.tables[name].rate = rate * self.scale * late
 

@@ -107,8 +107,7 @@ class Watcher:
         free = sized(free, pixels)
         view = self.views.get(self.view.value) if self.views else None
         if view is not None:
-            distance = float(np.linalg.norm(np.asarray(browser.look_at) - view.camera.center))
-            if is_at(free, view.camera, distance):
+            if is_at(free, view.camera, float(np.linalg.norm(np.asarray(browser.look_at) - view.camera.center))):
                 camera, box = framed(view.camera, free.width, free.height)
                 return camera, view, box
         return free, None, np.s_[:, :]

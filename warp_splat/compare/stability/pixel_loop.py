@@ -55,8 +55,7 @@ def underflow() -> Problem:
 def tile() -> Problem:
     """100,000 small Gaussians in one tile; pixels stop after some thousands."""
     camera = look(4, 4, seed=None)
-    arrays = cloud(6, 100_000, camera, sigma=(0.2, 0.6), opacity=(0.004, 0.02))
-    return Problem(tensors(arrays), camera)
+    return Problem(tensors(cloud(6, 100_000, camera, sigma=(0.2, 0.6), opacity=(0.004, 0.02))), camera)
 
 
 def edge(steps: int, side: float) -> Problem:

@@ -111,8 +111,7 @@ def seen_through(camera: Camera, seed: int, options: RasterOptions | None = None
 def size(width: int, height: int) -> Problem:
     """An image of this size, seen at 50 degrees along its longer side."""
     longest = max(width, height)
-    fov = 2 * np.degrees(np.arctan(width / longest * np.tan(np.radians(25))))
-    camera = look(width, height, fov)
+    camera = look(width, height, 2 * np.degrees(np.arctan(width / longest * np.tan(np.radians(25)))))
     arrays = cloud(39, 20, camera, sigma=(1, 1 + longest / 20), opacity=(0.05, 0.5))
     return Problem(tensors(arrays), camera, conditioned=True)
 
