@@ -57,6 +57,7 @@ def _readme() -> list[tuple]:
         ),
         ("recorded naively is wrong by {} %", round(100 * min(f.errors("plain")))),
         ("Without them it takes {} to {} times the time", *f.span(f.times_manual("generated"), "{:.0f}".format)),
+        ("the adjoint takes up to {} times as long", f.two(max(f.times_manual("stepwise")))),
         ("modes differ by {} dB, seeds by {} dB", *f.scatter()),
         ("shrink from {} lines to {}.", f.rules("manual"), f.rules("stepwise")),
         ("Measured on {}, by `uv run python -m warp_splat.compare`", f.compared_on()),
@@ -160,7 +161,7 @@ def _adjoints() -> list[tuple]:
         ("It costs {} dB, or {} dB if applied", f.one(f.lost("cap 128")), f.one(f.lost("cap 128, rendering only"))),
         ("it takes {} times as long as projection and colors", f.one(f.projection_backwards())),
         ("it gains {} to {} dB over the affine", *f.span(f.gained(), "{:.0f}".format)),
-        ("ends {} dB lower (one seed)", f.two(f.lost("ellipsoid"))),
+        ("at the same speed, and PSNR differs by {} dB (one seed)", f"{-f.lost('ellipsoid'):+.2f}"),
         ("runs {} named cases, {} verdicts", f.cases(), len(f.rows("stability"))),
         (
             "direction the image errs by {}.",
