@@ -102,8 +102,7 @@ class Prober:
     def alpha(self, sigma: float, opacity: float) -> np.ndarray:
         """Of a ball in the middle, [H, W], without thresholds."""
         thresholds = {"alpha_min": 0.0, "alpha_max": 1.0, "t_min": 0.0, "blur": self.options.get("blur", oracle.BLUR)}
-        ball = balls(PROBE, [CENTER - self.shift], 3.0, sigma, opacity, GREEN)
-        return self.exact(ball, **thresholds).alpha.numpy()
+        return self.exact(balls(PROBE, [CENTER - self.shift], 3.0, sigma, opacity, GREEN), **thresholds).alpha.numpy()
 
     def measured(self, option: str, low: float, high: float) -> str:
         """Sets an option to the middle of an interval, or to a known value that the interval holds; its name."""

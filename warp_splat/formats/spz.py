@@ -147,8 +147,7 @@ def _unpack_quats(stream: np.ndarray) -> np.ndarray:
 def _unpack_quats2(stream: np.ndarray) -> np.ndarray:
     """Version 2: x y z as bytes, w not negative."""
     xyz = stream.reshape(-1, 3).astype(np.float32) / np.float32(127.5) - 1
-    w = np.sqrt(np.maximum(0, 1 - (xyz * xyz).sum(axis=1, keepdims=True)))
-    return np.concatenate([w, xyz], axis=1)
+    return np.concatenate([np.sqrt(np.maximum(0, 1 - (xyz * xyz).sum(axis=1, keepdims=True))), xyz], axis=1)
 
 
 def _sizes(version: int, count: int, degree: int, file_bytes: int) -> list[int]:

@@ -22,7 +22,7 @@ OUTLIER = 3.0  # standard deviations, as the median of the residuals tells them
 COARSE = 0.1  # of the extent: GPS that errs by more is not taken
 USUAL = 5.0  # units: half of what photographs show is farther away, where nothing tells the scale
 TURNED = 0.7  # cosine: of where photographs have their top, or look, against up
-LINE = 0.1  # share of the extent that positions leave a straight line by, below which they do not tell up
+LINE = 0.1  # share of the extent that positions leave a line by, or a plane, below which they do not tell a turn
 
 
 def georeference(model: pycolmap.Reconstruction, database: Path, source: str, seed: int, say: Report) -> dict | None:
@@ -75,7 +75,7 @@ def georeference(model: pycolmap.Reconstruction, database: Path, source: str, se
     text = ""
     if right.sum() < max(LEAST, len(names) / 2) or error > COARSE * extent:
         text = f"{right.sum()} of {len(names)} fit within {error:.2g} m, where they span {extent:.3g} m"
-    elif tops < -TURNED or (tops < TURNED and ahead > TURNED):
+    elif _is_flat(world[right]) and (tops < -TURNED or (tops < TURNED and ahead > TURNED)):
         text = "photographs would stand upside down, or look at the sky, as if x and y were exchanged"
     if text and source != "auto":
         raise InputError(f"{source}: expected positions that fit the cameras, but {text}; check names and axes.")
@@ -127,6 +127,12 @@ def fit(
         residuals = np.linalg.norm(fitted * pairs[0] - pairs[1], axis=1)
         right = residuals <= OUTLIER * 1.4826 * np.median(residuals[right]) + 1e-9 * _extent(world)
     return fitted, residuals[: len(world)], right[: len(world)]
+
+
+def _is_flat(points: np.ndarray) -> bool:
+    """Whether their mirror image fits them as well, turned over."""
+    spans = np.linalg.svd(points - points.mean(0), compute_uv=False)
+    return bool(spans[2] < LINE * spans[0])
 
 
 def _extent(points: np.ndarray) -> float:
@@ -191,7 +197,7 @@ def read_places(path: Path) -> tuple[list[str], list[tuple[list[str], list[float
         for row, (_, numbers) in zip(rows, found, strict=True):
             if len(row) != len(first) or not np.isfinite(numbers).all():
                 raise Unexpected(f"the line {','.join(row):.80}")
-        named = [names[0] for names, _ in found if first == POSITIONS]
-        if twice := {name for name in named if named.count(name) > 1}:
-            raise Unexpected(f"more than one line for {few(sorted(twice)):.200}")
+        named, counts = np.unique([names[0] for names, _ in found], return_counts=True)
+        if first == POSITIONS and (counts > 1).any():
+            raise Unexpected(f"more than one line for {few(named[counts > 1]):.200}")
         return first, found

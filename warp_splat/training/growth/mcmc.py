@@ -63,9 +63,8 @@ class Mcmc:
             drawn = torch.randn(scales.shape, generator=random, device=scales.device)
         scales, quats, opacities = scales[faint], raw["quats"].detach()[faint], opacities[faint]
         gate = activate(scales, SHARPNESS * (PRUNE_OPACITY - opacities))[1] * (opacities < STILL)
-        rate = self.optimizer.tables["means"].rate
         # the covariance R S S R' times a normal vector is R S S times another
-        moved = rotate(quats, scales * scales * drawn) * (NOISE * rate * gate)[:, None]
+        moved = rotate(quats, scales * scales * drawn) * (NOISE * self.optimizer.tables["means"].rate * gate)[:, None]
         means = raw["means"].detach()
         means[faint] = means[faint] + moved.nan_to_num(0.0, 0.0, 0.0)
 
