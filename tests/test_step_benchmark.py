@@ -1,5 +1,6 @@
-"""What ``benchmarks/step.py``, ``savings.py`` and ``derivatives.py`` count and compare is right."""
+"""What ``benchmarks/step.py``, ``savings.py``, ``blend.py`` and ``derivatives.py`` count and compare is right."""
 
+import blend
 import derivatives
 import gpu_steps
 import limits
@@ -151,3 +152,13 @@ def test_serial_time_is_what_slices_do_not_share(two_threads):
     assert pool._Job is job and all(
         0.0 <= alone[stage] <= seconds[stage] for stage in (*gpu_steps.STAGES, "whole step")
     )
+
+
+def test_blends_in_lanes_agree_with_those_of_one_pixel_each():
+    scene = made_up.blend_scene(count=300, width=64, height=48)
+    upstream = torch.from_numpy(np.random.default_rng(1).normal(size=(48, 64, 3)).astype(np.float32))
+    drivers = [blend.Lanes(scene, upstream), blend.Scalar(scene, upstream)]
+    for driver in drivers:
+        driver.forward()
+        driver.adjoint()
+    blend.compare(*drivers)  # raises if they do not
