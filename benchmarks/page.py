@@ -84,7 +84,7 @@ def split(splats: SplatArrays, rows: np.ndarray) -> SplatArrays:
 
 def make_models(model: Path, folder: Path) -> dict[str, Path]:
     """The model, a million Gaussians of it by splits, with its cameras; a million made up."""
-    iteration, (splats, antialiased), trained = model_folder.open_model(model)
+    iteration, (splats, antialiased, *_), trained = model_folder.open_model(model)
     while len(splats.means) < MILLION:
         splats = split(splats, np.argsort(-sizes(splats))[: MILLION - len(splats.means)])
     save_gaussians(model_folder.ply_path(folder / "split", iteration), SplatFile(splats, antialiased))

@@ -139,6 +139,14 @@ def test_what_hangs_dies_or_draws_nothing_gets_a_row(importable, function, says)
 
 
 @pytest.mark.slow
+def test_what_refuses_is_asked_again(importable):
+    renderer = Renderer("wrong_renderer:ends_early")
+    verdicts = [row.verdict for row in measure(renderer, {}, scenes=("one", "two", "cloud", "opaque", "faint"))]
+    renderer.close()
+    assert len(verdicts) == 5 and all("refuses: EOFError" in verdict for verdict in verdicts)
+
+
+@pytest.mark.slow
 def test_a_page_that_hangs_gets_a_row_and_the_next_scene_is_drawn(tmp_path):
     """Playwright gives the first one up after half a minute; that tab answers no more."""
     pytest.importorskip("playwright")

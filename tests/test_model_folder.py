@@ -224,4 +224,6 @@ def test_open_model(tmp_path, mark, monkeypatch, fails, capsys):
         assert lost in said
     assert main(["convert", str(folder), str(tmp_path / "a.glb")]) == 0
     drawn = model_folder.open_model(tmp_path / "a.glb")
+    (folder / "coordinates.json").write_text("{")
+    assert model_folder.open_model(folder, 3)[0] == 3 and "coordinates.json" in fails("convert", folder, target)
     assert drawn[1].linear and drawn[1].coordinates["origin"] == [1.0, 2.0, 3.0] and drawn[2]["linear_light"]

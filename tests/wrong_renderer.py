@@ -105,6 +105,10 @@ def draws_nothing(means, quats, scales, opacities, sh, camera, background):
     return background.expand(camera.height, camera.width, 3)
 
 
+def ends_early(*given):
+    raise EOFError("no data left")
+
+
 def counts(means, quats, scales, opacities, sh, camera, background):
     """Whole numbers, of which nobody knows whether 1 or 255 is white."""
     return torch.zeros((camera.height, camera.width, 3), dtype=torch.int64)

@@ -115,7 +115,7 @@ def rasterize(
                 leaf.requires_grad_(recorded and named[name].requires_grad)
         found = _render(leaves, named, camera, background, adjoint, options)
         shown = {name: tensor for name in PIXELS if (tensor := getattr(found, name)) is not None}
-        if unknown := set(out or {}) - set(shown):
+        if unknown := {name for name, room in (out or {}).items() if room is not None} - set(shown):
             raise InputError(f"out: expected some of {', '.join(shown)}, got {min(unknown)!r}; leave that out.")
         with stage("tape"):
             pixels = {name: _array(name, tensor, recorded, (out or {}).get(name)) for name, tensor in shown.items()}

@@ -3,6 +3,7 @@
 import importlib
 import multiprocessing
 import os
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,6 +16,7 @@ from warp_splat.compare.workloads import Workload
 from warp_splat.errors import InputError, reason_of
 
 START_LIMIT = 300.0  # s for its imports, of which some compile
+REFUSES = "refuses"
 
 
 class RendererFailed(Exception):
@@ -55,7 +57,7 @@ class Renderer:
             self.process = context.Process(target=_serve, args=(other, self.place), daemon=True)
             self.process.start()
             other.close()
-            self._receive(START_LIMIT)
+            self._receive(START_LIMIT, serves=False)
         given = [tensor.numpy() for tensor in (*workload.gaussians, workload.background)]
         self.connection.send((given, workload.camera, None if upstream is None else upstream.numpy(), runs))
         image, gradients, same = self._receive(self.limit * runs)
@@ -68,14 +70,16 @@ class Renderer:
         eight_bit = image.dtype == np.uint8
         return Answer(image.astype(np.float64) / (255 if eight_bit else 1), eight_bit, found, same, runs)
 
-    def _receive(self, limit: float):
+    def _receive(self, limit: float, serves: bool = True):
+        """What the process answers; ``serves``: whether it goes on after it has refused."""
         try:
             found = self.connection.recv() if self.connection.poll(limit) else f"hangs: no answer in {limit:.0f} s"
         except EOFError:
             self.process.join()
             found = f"crashes: its process ended with {self.process.exitcode}"
         if isinstance(found, str):
-            self.close()
+            if not (serves and found.startswith(REFUSES)):
+                self.close()
             raise RendererFailed(found)
         return found
 
@@ -113,14 +117,21 @@ def _serve(connection, place: str) -> None:
     try:
         render = function_of(place)
         connection.send(())
+    except Exception as error:
+        connection.send(_phrase(error))
+        return
+    with suppress(EOFError):  # the other end is gone
         while True:
             given, camera, upstream, runs = connection.recv()
-            runs = [_draw(render, given, camera, upstream) for _ in range(runs)]
-            connection.send((*runs[0], all(_bits(run) == _bits(runs[0]) for run in runs)))
-    except EOFError:  # the other end is gone
-        return
-    except Exception as error:
-        connection.send(f"refuses: {type(error).__name__}: {reason_of(error)}")
+            try:
+                runs = [_draw(render, given, camera, upstream) for _ in range(runs)]
+                connection.send((*runs[0], all(_bits(run) == _bits(runs[0]) for run in runs)))
+            except Exception as error:
+                connection.send(_phrase(error))
+
+
+def _phrase(error: Exception) -> str:
+    return f"{REFUSES}: {type(error).__name__}: {reason_of(error)}"
 
 
 def _bits(run) -> bytes:

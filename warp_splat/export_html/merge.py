@@ -71,8 +71,7 @@ def groups(points: np.ndarray, important: np.ndarray, count: int) -> tuple[np.nd
         here, weight = points[order], weights[order]
         middle = np.add.reduceat(here, starts) / (ends - starts)[:, None]
         spread = np.add.reduceat(weight[:, None] * (here - middle[group]) ** 2, starts)
-        along = here[np.arange(total), spread.argmax(axis=1)[group]]
-        order = order[np.lexsort((along, group))]
+        order = order[np.lexsort((here[np.arange(total), spread.argmax(axis=1)[group]], group))]
         sums = np.append(0.0, np.cumsum(weights[order]))
         first = parts // 2
         cuts = np.searchsorted(sums, sums[starts] + (sums[ends] - sums[starts]) * first / parts)

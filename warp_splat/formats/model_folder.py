@@ -17,7 +17,6 @@ import numpy as np
 
 from warp_splat.camera import Camera
 from warp_splat.errors import InputError, refusing
-from warp_splat.formats.coordinates import read_coordinates
 from warp_splat.formats.exchange import FORMATS, load_gaussians
 from warp_splat.formats.files import T, Unexpected, read_json, write_text
 from warp_splat.formats.splats import SplatFile, cropped
@@ -145,7 +144,7 @@ def open_model(path: str | Path, iteration: int = -1, crop: Sequence[float] = ()
         iteration, found = 0, load_gaussians(path)
     else:
         iteration = find_iteration(path, iteration)
-        found = load_gaussians(ply_path(path, iteration))._replace(coordinates=read_coordinates(path))
+        found = load_gaussians(ply_path(path, iteration))
         options = read_cfg_args(path) if (path / "cfg_args").exists() else options
     options = {"antialiasing": found.antialiased, "linear_light": found.linear, **options}
     marks = {"antialiased": bool(options["antialiasing"]), "linear": bool(options["linear_light"])}

@@ -62,8 +62,7 @@ def _table_of(splats: SplatArrays) -> np.ndarray:
     rest = sh[:, 1:].transpose(0, 2, 1).reshape(count, 3 * (coefficients - 1))
     columns = (means, np.zeros((count, 3)), sh[:, 0], rest, opacities[:, None], scales, quats)
     names = (*POSITION, *NORMAL, *F_DC, *_rest_names(rest.shape[1]), "opacity", *SCALE, *ROTATION)
-    table = np.concatenate(columns, axis=1, dtype="<f4")
-    return table.view([(name, "<f4") for name in names])[:, 0]
+    return np.concatenate(columns, axis=1, dtype="<f4").view([(name, "<f4") for name in names])[:, 0]
 
 
 def save_points(path: str | Path, points: np.ndarray, colors: np.ndarray) -> None:

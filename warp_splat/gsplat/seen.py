@@ -95,8 +95,7 @@ def _variances(request: Request, to_x: torch.Tensor, to_y: torch.Tensor) -> tupl
     to_x, to_y = to_x.double(), to_y.double()  # in which a flat Gaussian's determinant survives
     across = rows_turned(to_x, covars)
     xx, xy, yy = (across * to_x).sum(-1), (across * to_y).sum(-1), (rows_turned(to_y, covars) * to_y).sum(-1)
-    found = (xx, xy, yy, (xx * yy - xy * xy).clamp_min(0.0))
-    return tuple(part.to(request.means.dtype) for part in found)
+    return tuple(part.to(request.means.dtype) for part in (xx, xy, yy, (xx * yy - xy * xy).clamp_min(0.0)))
 
 
 def _pinhole(request: Request, x: torch.Tensor, y: torch.Tensor, z: torch.Tensor):

@@ -153,8 +153,7 @@ def check_picture(lens: Lens, left: float, top: float, right: float, bottom: flo
         InputError: if its coefficients fold it inside of the picture, or a panorama is not one of all around.
     """
     if lens.model == "EQUIRECTANGULAR":
-        sides = np.array([left, top, right, bottom]) / np.pi
-        if np.abs(sides - [-1, -0.5, 1, 0.5]).max() > SEAM:
+        if np.abs(np.array([left, top, right, bottom]) / np.pi - [-1, -0.5, 1, 0.5]).max() > SEAM:
             raise InputError(
                 "Camera lens EQUIRECTANGULAR: expected a picture of 2:1 that shows all around, fx = width / (2 pi), "
                 f"fy = height / pi, cx and cy in its middle, got {np.degrees(right - left):.1f} x "

@@ -105,7 +105,7 @@ def written_bytes(name: Path, file: SplatFile) -> int:
 
 def write(path: Path, finished: Finished, splats: SplatArrays) -> None:
     """Write ``splats`` in place of those of a model, and print what that saved, and lost."""
-    before, notes = finished.file, finished.beyond_files
+    before, notes = finished.placed(), finished.beyond_files
     after = before._replace(splats=splats)
     save_gaussians(path, after, notes.append)
     old, new = written_bytes(path, before), written_bytes(path, after)

@@ -94,8 +94,7 @@ def find_strongest(splats: Splats2D, blending: Blending) -> tuple[torch.Tensor, 
         weights = Weights.apply(splats.means2d, splats.conics, splats.opacities, weights, ranks, blending)
     # an embedding, whose adjoint sums in one order, on a GPU as well; the last row is that of no Gaussian
     depths = torch.cat([splats.depths, splats.depths.new_zeros(1)])[:, None]
-    median_depth = torch.nn.functional.embedding(middle % len(depths), depths)
-    return gaussians, weights, median_depth.view(shape)
+    return gaussians, weights, torch.nn.functional.embedding(middle % len(depths), depths).view(shape)
 
 
 def _launch(blending: Blending, pixels: torch.Tensor, group: Group, strongest: tuple[torch.Tensor, ...] = ()) -> None:

@@ -98,8 +98,7 @@ def bin_by_sorting(
     listed = torch.empty(count, dtype=torch.int16 if narrow else torch.int32, device=device)
     begins, ranks = _list_tiles(splats, ends, listed, torch.empty(0, dtype=torch.int32, device=device), camera, options)
     if worlds:
-        first = _first_tiles(worlds, tiles_x * tiles_y, device).to(listed.dtype)
-        listed += first[wp.to_torch(gaussians)[ranks]]
+        listed += _first_tiles(worlds, tiles_x * tiles_y, device).to(listed.dtype)[wp.to_torch(gaussians)[ranks]]
     listed, numbers = torch.sort(listed, stable=True)
     new = partial(torch.empty, dtype=torch.int32, device=device)
     instances, places, ranges = new(count), new(count), new(tiles_x * tiles_y * pictures, 2)

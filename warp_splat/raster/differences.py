@@ -177,8 +177,7 @@ def _natural(scene: MovableScene, name: str) -> torch.Tensor | float:
         return float(value.square().mean().sqrt()) or 1.0
     pixel = scene.out.depths / scene.camera.fx  # at the Gaussian, world units
     if name not in (*INPUTS, *INTERMEDIATES):
-        typical = float(pixel[pixel > 0].median()) if (pixel > 0).any() else 1.0
-        return natural_size(scene.camera, name, typical)
+        return natural_size(scene.camera, name, float(pixel[pixel > 0].median()) if (pixel > 0).any() else 1.0)
     if name == "means":  # the short axis, which is no less than half a pixel wide on the image
         return torch.hypot(scene.inputs["scales"].amin(1), 0.5 * pixel)[:, None]
     xx, xy, yy = scene.out.conics.unbind(1)
@@ -218,8 +217,7 @@ def _is_smooth(differences: torch.Tensor, largest: float) -> torch.Tensor:
     """[H, W] bool: pixels that are not far above the median of those that are reached."""
     size = differences.abs().amax(2) / largest
     reached = size[size > 0]
-    typical = float(reached.median()) if len(reached) else 0.0
-    return size <= min(CUT * max(typical, ROUNDING), JUMP)
+    return size <= min(CUT * max(float(reached.median()) if len(reached) else 0.0, ROUNDING), JUMP)
 
 
 def _extrapolate(scene: MovableScene, rung: int, far: tuple, near: tuple) -> Quotient:

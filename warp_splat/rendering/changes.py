@@ -41,7 +41,7 @@ def convert(config: ConvertConfig) -> int:
     if os.path.exists(config.target) and os.path.samefile(source, config.target):
         raise InputError(f"{config.target}: expected another file than the source; name a new one.")
     notes: list[str] = []
-    before = save_gaussians(config.target, finished.file, notes.append).splats
+    before = save_gaussians(config.target, finished.placed(), notes.append).splats
     after = load_gaussians(config.target).splats
     print(f"{config.target}: {len(after.means)} Gaussians, SH degree {COEFFICIENTS.index(after.sh.shape[1])}")
     notes = losses(before, after) + notes + finished.beyond_files

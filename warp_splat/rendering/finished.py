@@ -12,8 +12,10 @@ from warp_splat.camera import Camera
 from warp_splat.color import to_bytes
 from warp_splat.config import PROJECTIONS, RasterOptions
 from warp_splat.errors import InputError
+from warp_splat.formats.coordinates import read_coordinates
 from warp_splat.formats.exposures import Exposures, read_exposures
-from warp_splat.formats.model_folder import open_model, ply_path, read_cameras, read_environment
+from warp_splat.formats.model_folder import is_file_of_gaussians, open_model, ply_path, read_cameras, read_environment
+from warp_splat.formats.splats import SplatFile
 from warp_splat.gaussians import GaussianModel
 from warp_splat.raster.api import RenderOutput
 from warp_splat.raster.api import render as render_gaussians
@@ -54,6 +56,11 @@ class Finished:
         found = RasterOptions(antialiasing=bool(self.trained.get("antialiasing")))
         projection = self.trained.get("projection")
         return replace(found, projection=projection) if projection in PROJECTIONS else found
+
+    def placed(self) -> SplatFile:
+        """Its Gaussians, and where they are in the world. Raises InputError if ``coordinates.json`` is damaged."""
+        where = self.file.coordinates if is_file_of_gaussians(self.path) else read_coordinates(self.path)
+        return self.file._replace(coordinates=where)
 
     @property
     def beyond_files(self) -> list[str]:

@@ -134,7 +134,7 @@ def merge_blocks(config: MergeConfig) -> int:
         colors.append(cloud[1][own])
         named = lambda entries: {str(entry["img_name"]): entry for entry in entries}  # noqa: E731
         cameras |= read_json(place / CAMERAS, "cameras as training writes them", named)
-    merged = models[0][1]._replace(splats=arranged(concatenated(splats)))
+    merged = models[0][1]._replace(splats=arranged(concatenated(splats)), linear=False)  # cfg_args says it
     save_gaussians(path, merged)
     for old in {*folder.glob("point_cloud/*/point_cloud.ply")} - {path}:  # merged before, from blocks of other lengths
         old.unlink()

@@ -22,7 +22,8 @@ OUTLIER = 3.0  # standard deviations, as the median of the residuals tells them
 COARSE = 0.1  # of the extent: GPS that errs by more is not taken
 USUAL = 5.0  # units: half of what photographs show is farther away, where nothing tells the scale
 TURNED = 0.7  # cosine: of where photographs have their top, or look, against up
-LINE = 0.1  # share of the extent that positions leave a line by, or a plane, below which they do not tell a turn
+DOUBT = " (photographs stand upside down there, or look up: are x and y exchanged?)"  # flat positions fit turned over
+LINE = 0.1  # share of the extent that positions leave a straight line by, below which they do not tell up
 
 
 def georeference(model: pycolmap.Reconstruction, database: Path, source: str, seed: int, say: Report) -> dict | None:
@@ -71,20 +72,17 @@ def georeference(model: pycolmap.Reconstruction, database: Path, source: str, se
     fitted, residuals, right = fit(np.array([centers[name] for name in names]), world - origin, up, seed)
     extent = _extent(world[right])
     error = float(np.median(residuals[right])) if right.any() else np.inf
-    tops, ahead = np.stack([up, axes[2]]) @ fitted.rotation.matrix()[2]
-    text = ""
     if right.sum() < max(LEAST, len(names) / 2) or error > COARSE * extent:
         text = f"{right.sum()} of {len(names)} fit within {error:.2g} m, where they span {extent:.3g} m"
-    elif _is_flat(world[right]) and (tops < -TURNED or (tops < TURNED and ahead > TURNED)):
-        text = "photographs would stand upside down, or look at the sky, as if x and y were exchanged"
-    if text and source != "auto":
-        raise InputError(f"{source}: expected positions that fit the cameras, but {text}; check names and axes.")
-    if text:
+        if source != "auto":
+            raise InputError(f"{source}: expected positions that fit the cameras, but {text}; check names and axes.")
         say(f"no coordinates, since positions do not fit the cameras: {text}")
         return None
     _move(model, fitted)
     left_out = [name for name, good in zip(names, right, strict=True) if not good]
     rest = f"; left out: {few(left_out)}" if left_out else ""
+    tops, ahead = np.stack([-axes[1], axes[2]]) @ fitted.rotation.matrix()[2]
+    reference += DOUBT if tops < -TURNED or (tops < TURNED and ahead > TURNED) else ""
     say(f"coordinates: {reference}, {right.sum()} positions fit within {error:.2g} m (median){rest}")
     return _described(origin, reference, fitted.scale, dict(zip(names, residuals.tolist(), strict=True)), left_out)
 
@@ -127,12 +125,6 @@ def fit(
         residuals = np.linalg.norm(fitted * pairs[0] - pairs[1], axis=1)
         right = residuals <= OUTLIER * 1.4826 * np.median(residuals[right]) + 1e-9 * _extent(world)
     return fitted, residuals[: len(world)], right[: len(world)]
-
-
-def _is_flat(points: np.ndarray) -> bool:
-    """Whether their mirror image fits them as well, turned over."""
-    spans = np.linalg.svd(points - points.mean(0), compute_uv=False)
-    return bool(spans[2] < LINE * spans[0])
 
 
 def _extent(points: np.ndarray) -> float:

@@ -143,6 +143,8 @@ def open_scene(config: TrainConfig, begun: Checkpoint | None, say: Say, processe
     if scene.start and not begun and scene.start.antialiased != config.model.antialiasing:
         which = "with" if scene.start.antialiased else "without"
         say(f"Warning: {data.start_ply} was trained {which} --antialiasing; the same option keeps its sizes right.")
+    if scene.start and not begun and scene.start.linear and not scene.linear:
+        say(f"Warning: {data.start_ply} is in linear light, and the photographs are not; its colors start too dark.")
     return scene
 
 
