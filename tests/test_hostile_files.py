@@ -58,7 +58,7 @@ def survive(folder, kind, data):
     path.write_bytes(data)
     try:
         with little_memory(MEMORY + 100 * len(data)), warnings.catch_warnings(action="error"):
-            splats, antialiased, _ = load_gaussians(path, report=lines.append)
+            splats, antialiased, *_ = load_gaussians(path, report=lines.append)
     except InputError as error:
         one_sentence(error, path)
         return False

@@ -62,7 +62,7 @@ def test_it_reads_what_we_write(tmp_path, file, ending, actions):
     ours = tmp_path / f"a{ending}"
     save_gaussians(ours, file, report=lambda line: None)
     transform(ours, tmp_path / "theirs.ply", *actions)
-    theirs, antialiased, _ = load_gaussians(tmp_path / "theirs.ply")
+    theirs, antialiased, *_ = load_gaussians(tmp_path / "theirs.ply")
     # it takes the bytes of a quaternion as 2 b / 255 - 1, where the first viewer has b / 128 - 1
     assert_same(theirs, load_gaussians(ours).splats, shape=0.05 if ending == ".splat" else 1e-3)
     assert antialiased == (ending != ".splat")
@@ -71,7 +71,7 @@ def test_it_reads_what_we_write(tmp_path, file, ending, actions):
 @pytest.mark.parametrize(("version", "actions"), [("3", HALF_TURN), ("4", HALF_TURN)])
 def test_we_read_the_spz_that_it_writes(tmp_path, file, version, actions):
     transform(tmp_path / "ours.ply", tmp_path / "theirs.spz", *actions, "--spz-version", version)
-    theirs, antialiased, _ = load_gaussians(tmp_path / "theirs.spz")
+    theirs, antialiased, *_ = load_gaussians(tmp_path / "theirs.spz")
     # of harmonics it rounds to 1/128 first and then to 1/16: off by 1/256 + 1/16 at most
     assert_same(theirs, file.splats, (*STEPS, 1 / 256 + 1 / 16), shape=0.2)
     assert antialiased
@@ -79,7 +79,7 @@ def test_we_read_the_spz_that_it_writes(tmp_path, file, version, actions):
 
 def test_we_read_the_compressed_ply_that_it_writes(tmp_path, file):
     transform(tmp_path / "ours.ply", tmp_path / "theirs.compressed.ply")
-    theirs, antialiased, _ = load_gaussians(tmp_path / "theirs.compressed.ply")
+    theirs, antialiased, *_ = load_gaussians(tmp_path / "theirs.compressed.ply")
     order = KDTree(theirs.means).query(file.splats.means)[1]  # it has an order of its own
     theirs = SplatArrays(*(array[order] for array in theirs))
     ranges = np.ptp(file.splats.means, axis=0).max()  # of a chunk, at most
@@ -94,14 +94,14 @@ def test_sog_both_ways(tmp_path):
     file.splats.sh[:, 1:] = file.splats.sh[np.random.default_rng(1).integers(0, 100, 2000), 1:]
     written, *_ = save_gaussians(tmp_path / "ours.sog", file, report=lambda line: None)
     transform(tmp_path / "ours.sog", tmp_path / "back.ply")
-    theirs, antialiased, _ = load_gaussians(tmp_path / "back.ply")
+    theirs, antialiased, *_ = load_gaussians(tmp_path / "back.ply")
     ours = load_gaussians(tmp_path / "ours.sog").splats
     inside = np.abs(ours.opacities) < 13  # it moves opacities of 0 and 1 by a millionth
     assert_same(*(SplatArrays(*(array[inside] for array in splats)) for splats in (theirs, ours)))
     assert antialiased and inside.mean() > 0.98
     save_gaussians(tmp_path / "ours.ply", SplatFile(written, True))
     transform(tmp_path / "ours.ply", tmp_path / "theirs.sog", "-g", "cpu")
-    theirs, antialiased, _ = load_gaussians(tmp_path / "theirs.sog")
+    theirs, antialiased, *_ = load_gaussians(tmp_path / "theirs.sog")
     order = KDTree(theirs.means).query(written.means)[1]  # it has an order of its own
     assert sorted(order) == list(range(2000)) and antialiased
     rows = np.flatnonzero(sigmoid(written.opacities) > 1 / 255)  # its images lose the colors of those it writes as 0
