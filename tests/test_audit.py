@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -136,6 +137,17 @@ def test_what_hangs_dies_or_draws_nothing_gets_a_row(importable, function, says)
     renderer.close()
     assert [says in row.verdict for row in rows] == [True, True]
     assert {row.level for row in rows} <= {"warning", "error"}
+
+
+@pytest.mark.slow
+def test_what_dies_between_two_answers_ends_no_audit(importable):
+    renderer = Renderer("wrong_renderer:dies_later")
+    rows = []
+    for row in measure(renderer, {}, scenes=("one", "two")):
+        rows.append(row.verdict)
+        time.sleep(0.5)
+    renderer.close()
+    assert len(rows) == 2 and any("ended with 7" in verdict for verdict in rows)
 
 
 @pytest.mark.slow

@@ -1,6 +1,7 @@
 """A slow renderer in plain torch whose every rule can be broken: what an audit has to find out."""
 
 import os
+import threading
 import time
 from dataclasses import dataclass
 
@@ -107,6 +108,12 @@ def draws_nothing(means, quats, scales, opacities, sh, camera, background):
 
 def ends_early(*given):
     raise EOFError("no data left")
+
+
+def dies_later(means, quats, scales, opacities, sh, camera, background):
+    """After its answer."""
+    threading.Timer(0.05, os._exit, [7]).start()
+    return torch.zeros((camera.height, camera.width, 3))
 
 
 def counts(means, quats, scales, opacities, sh, camera, background):

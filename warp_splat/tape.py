@@ -116,7 +116,7 @@ def rasterize(
         found = _render(leaves, named, camera, background, adjoint, options)
         shown = {name: tensor for name in PIXELS if (tensor := getattr(found, name)) is not None}
         if unknown := {name for name, room in (out or {}).items() if room is not None} - set(shown):
-            raise InputError(f"out: expected some of {', '.join(shown)}, got {min(unknown)!r}; leave that out.")
+            raise InputError(f"out: expected some of {', '.join(shown)}, got {min(map(str, unknown))!r}; omit it.")
         with stage("tape"):
             pixels = {name: _array(name, tensor, recorded, (out or {}).get(name)) for name, tensor in shown.items()}
             if recorded:

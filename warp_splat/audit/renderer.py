@@ -59,7 +59,8 @@ class Renderer:
             other.close()
             self._receive(START_LIMIT, serves=False)
         given = [tensor.numpy() for tensor in (*workload.gaussians, workload.background)]
-        self.connection.send((given, workload.camera, None if upstream is None else upstream.numpy(), runs))
+        with suppress(OSError):  # it has died since the last answer
+            self.connection.send((given, workload.camera, None if upstream is None else upstream.numpy(), runs))
         image, gradients, same = self._receive(self.limit * runs)
         shape = (workload.camera.height, workload.camera.width, 3)
         if image.shape != shape:
@@ -74,7 +75,7 @@ class Renderer:
         """What the process answers; ``serves``: whether it goes on after it has refused."""
         try:
             found = self.connection.recv() if self.connection.poll(limit) else f"hangs: no answer in {limit:.0f} s"
-        except EOFError:
+        except (EOFError, OSError):
             self.process.join()
             found = f"crashes: its process ended with {self.process.exitcode}"
         if isinstance(found, str):

@@ -139,8 +139,7 @@ def angle_of_view(lens: Lens, left: float, top: float, right: float, bottom: flo
     if lens.family.wide:
         return lens.limit
     rays = lens.undistorted(np.array([(x, y) for x in (left, right) for y in (top, bottom)]))
-    angles = np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2])
-    return float(np.nan_to_num(angles, nan=lens.limit).max())
+    return float(np.nan_to_num(np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2]), nan=lens.limit).max())
 
 
 @functools.lru_cache(maxsize=1024)
