@@ -198,7 +198,7 @@ def test_damaged_coordinates_get_one_sentence(tmp_path):
     assert read_coordinates(tmp_path) is None
     right = '{"origin": [1, 2, 3], '
     wrong = [right + f'"residuals": {found}}}' for found in ("[1, 2]", '{"a": "x"}', '{"a": Infinity}')]
-    wrong += [f'{{"origin": {found}}}' for found in ('["1", "2", "3"]', "[[1], [2], [3]]")]
+    wrong += [f'{{"origin": {found}}}' for found in ('["1", "2", "3"]', "[[1], [2], [3]]", "[true, 2, 3]")]
     wrong += [right + '"left_out": 5}', '{"origin": [1, 2]}', '{"origin": [1, 2, NaN]}', '{"origin": ["a", 2, 3]}']
     for text in (*wrong, f'{{"origin": [1{"0" * 400}, 2, 3]}}', "[]", "{"):
         (tmp_path / "coordinates.json").write_text(text)

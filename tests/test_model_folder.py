@@ -20,6 +20,7 @@ from warp_splat.formats import model_folder
 from warp_splat.formats.coordinates import write_coordinates
 from warp_splat.formats.exchange import load_gaussians, save_gaussians
 from warp_splat.formats.splats import SplatFile
+from warp_splat.scene.start import load_start
 from warp_splat.scene.types import Decoded, View
 
 ARGUMENTS = {
@@ -224,6 +225,7 @@ def test_open_model(tmp_path, mark, monkeypatch, fails, capsys):
         assert lost in said
     assert main(["convert", str(folder), str(tmp_path / "a.glb")]) == 0
     drawn = model_folder.open_model(tmp_path / "a.glb")
+    assert load_start(str(folder), print)[0].linear  # so that training can warn
     (folder / "coordinates.json").write_text("{")
     assert model_folder.open_model(folder, 3)[0] == 3 and "coordinates.json" in fails("convert", folder, target)
     assert drawn[1].linear and drawn[1].coordinates["origin"] == [1.0, 2.0, 3.0] and drawn[2]["linear_light"]

@@ -5,10 +5,12 @@ import struct
 
 import numpy as np
 import pytest
+from commands import changes_told
 from hostile import refusal
 from scenes import C0
-from splat_files import covariances, seen_colors, sigmoid, silent, some_file, some_splats, spz2, spz4
+from splat_files import covariances, seen_colors, sigmoid, silent, small_splats, some_file, some_splats, spz2, spz4
 
+from warp_splat.cli import main
 from warp_splat.formats.exchange import load_gaussians, save_gaussians
 from warp_splat.formats.splats import SplatFile, turned
 
@@ -191,3 +193,14 @@ def test_what_disagrees_is_refused(tmp_path, old, new, sentence):
     assert old.encode() in data
     (tmp_path / "b.ply").write_bytes(data.replace(old.encode(), new.encode(), 1))
     refusal(lambda: load_gaussians(tmp_path / "b.ply"), match=sentence)
+
+
+@pytest.mark.parametrize("size", [1.0, 1e-3])
+def test_pictures_of_small_models_are_compared(tmp_path, size, capsys):
+    """What is nearer than a fifth of a unit would not be drawn."""
+    splats = small_splats(200)
+    splats = splats._replace(means=size * splats.means, scales=splats.scales + np.float32(np.log(size)))
+    save_gaussians(tmp_path / "a.ply", SplatFile(splats), silent)
+    assert main(["convert", str(tmp_path / "a.ply"), str(tmp_path / "b.splat"), "--bound"]) == 0
+    measured, bound = changes_told(capsys.readouterr().out)
+    assert 0.001 < measured <= bound

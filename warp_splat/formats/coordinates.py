@@ -72,6 +72,6 @@ def checked(found: object) -> dict:
     residuals, left_out = found.get("residuals", {}), found.get("left_out", [])
     if not isinstance(residuals, dict) or not isinstance(left_out, list):
         raise Unexpected("residuals, or what was left out, that are not by name")
-    if not all(isinstance(n, int | float) and np.isfinite(float(n)) for n in (*origin, *residuals.values())):
+    if not all(type(n) in (int, float) and np.isfinite(float(n)) for n in (*origin, *residuals.values())):
         raise Unexpected("what is no finite number")
     return found

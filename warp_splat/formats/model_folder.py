@@ -22,6 +22,7 @@ from warp_splat.formats.files import T, Unexpected, read_json, write_text
 from warp_splat.formats.splats import SplatFile, cropped
 from warp_splat.lenses import Lens
 from warp_splat.lenses.shutter import Shutter
+from warp_splat.text import Report
 
 if TYPE_CHECKING:
     from warp_splat.scene.types import View
@@ -130,21 +131,24 @@ def is_file_of_gaussians(path: str | Path) -> bool:
     return path.is_file() or (not path.exists() and path.suffix.lower() in FORMATS)
 
 
-def open_model(path: str | Path, iteration: int = -1, crop: Sequence[float] = ()) -> tuple[int, SplatFile, dict]:
+def open_model(
+    path: str | Path, iteration: int = -1, crop: Sequence[float] = (), report: Report = print
+) -> tuple[int, SplatFile, dict]:
     """The iteration, the Gaussians and the options of the training, from a model folder or a file of Gaussians.
 
     Of a file, the iteration is 0. Where there is no cfg_args, the options are that every 8th view was held out, and
-    what the file tells. ``crop`` as :func:`warp_splat.formats.splats.cropped` takes it.
+    what the file tells. ``crop`` as :func:`warp_splat.formats.splats.cropped` takes it, ``report`` as
+    :func:`warp_splat.formats.exchange.load_gaussians`.
 
     Raises:
         InputError: if there is no such model, or it cannot be read.
     """
     path, options = Path(path), {"eval": True}
     if is_file_of_gaussians(path):
-        iteration, found = 0, load_gaussians(path)
+        iteration, found = 0, load_gaussians(path, report)
     else:
         iteration = find_iteration(path, iteration)
-        found = load_gaussians(ply_path(path, iteration))
+        found = load_gaussians(ply_path(path, iteration), report)
         options = read_cfg_args(path) if (path / "cfg_args").exists() else options
     options = {"antialiasing": found.antialiased, "linear_light": found.linear, **options}
     marks = {"antialiased": bool(options["antialiasing"]), "linear": bool(options["linear_light"])}

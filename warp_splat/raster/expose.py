@@ -42,8 +42,7 @@ def color_matrix(kind: str, numbers: torch.Tensor, pivot: float) -> torch.Tensor
     none = torch.zeros_like(numbers[:1])
     n = [numbers if i % 4 == 0 else none for i in range(12)] if kind == "gain" else list(numbers.split(1))
     diagonal = [1.0 + n[i] if i % 4 == 0 else n[i] for i in range(9)]
-    constant = [n[9 + k] + pivot * ((n[k] + n[3 + k]) + n[6 + k]) for k in range(3)]
-    return torch.cat(diagonal + constant)
+    return torch.cat(diagonal + [n[9 + k] + pivot * ((n[k] + n[3 + k]) + n[6 + k]) for k in range(3)])
 
 
 def load_color_maps(device: torch.device) -> None:

@@ -218,8 +218,7 @@ def _judge(name: str, trials: list[Trial], tolerance: float) -> GradientRow:
     pixels = sum(trial.quotient.pixels for trial in trials) / len(trials)
     unclear = uncertainty > 10 * tolerance or not pixels
     # of thousands of jumps the uncertainty sees fewer than there are
-    off = error > tolerance + (3 if unclear else 1) * uncertainty
-    verdict = "off" if off else "unclear" if unclear else "agrees"
+    verdict = "off" if error > tolerance + (3 if unclear else 1) * uncertainty else "unclear" if unclear else "agrees"
     return GradientRow(name, analytic, differences, uncertainties, error, uncertainty, pixels, verdict)
 
 

@@ -6,8 +6,7 @@ import numpy as np
 
 from warp_splat.camera import Camera
 from warp_splat.errors import InputError
-from warp_splat.formats.exchange import load_gaussians
-from warp_splat.formats.model_folder import find_iteration, is_file_of_gaussians, ply_path
+from warp_splat.formats.model_folder import open_model
 from warp_splat.formats.ply import GRAY
 from warp_splat.formats.splats import SplatFile
 from warp_splat.formats.stored import SH_C0
@@ -73,7 +72,7 @@ def load_start(path: str, report: Report) -> tuple[SplatFile, np.ndarray, np.nda
     Raises:
         InputError: if it is missing or not a file of Gaussians, or if there are none in it.
     """
-    file = load_gaussians(path if is_file_of_gaussians(path) else ply_path(path, find_iteration(path)), report)
+    _, file, _ = open_model(path, report=report)
     if not len(file.splats.means):
         raise InputError(f"{path}: expected at least one Gaussian to start from, found none; name another file.")
     colors = (255 * (SH_C0 * file.splats.sh[:, 0].astype(np.float64) + 0.5)).clip(0, 255).round().astype(np.uint8)
