@@ -11,7 +11,14 @@ from splat_files import some_file
 
 from warp_splat.cli import main
 from warp_splat.errors import InputError
-from warp_splat.formats.coordinates import MODEL_FROM_WORLD, kept, read_coordinates, write_coordinates
+from warp_splat.formats.coordinates import (
+    COMMENT,
+    MODEL_FROM_WORLD,
+    kept,
+    of_comments,
+    read_coordinates,
+    write_coordinates,
+)
 from warp_splat.formats.exchange import load_gaussians, save_gaussians
 from warp_splat.formats.model_folder import write_cameras
 from warp_splat.inspect.subject import Subject
@@ -199,13 +206,19 @@ def test_damaged_coordinates_get_one_sentence(tmp_path):
     right = '{"origin": [1, 2, 3], '
     wrong = [right + f'"residuals": {found}}}' for found in ("[1, 2]", '{"a": "x"}', '{"a": Infinity}')]
     wrong += [f'{{"origin": {found}}}' for found in ('["1", "2", "3"]', "[[1], [2], [3]]", "[true, 2, 3]")]
-    wrong += [right + '"left_out": 5}', '{"origin": [1, 2]}', '{"origin": [1, 2, NaN]}', '{"origin": ["a", 2, 3]}']
+    wrong += [
+        right + '"left_out": 5}',
+        right + '"reference": NaN}',
+        '{"origin": [1, 2]}',
+        '{"origin": [1, 2, NaN]}',
+        '{"origin": ["a", 2, 3]}',
+    ]
     for text in (*wrong, f'{{"origin": [1{"0" * 400}, 2, 3]}}', "[]", "{"):
         (tmp_path / "coordinates.json").write_text(text)
         with pytest.raises(InputError, match=r"coordinates\.json"):
             read_coordinates(tmp_path)
     write_coordinates(tmp_path, {"origin": [1.0, 2.0, 3.0]})
     assert json.loads((tmp_path / "coordinates.json").read_text()) == read_coordinates(tmp_path)
-    assert kept({"origin": [10**400, 2, 3]}) is None
+    assert kept({"origin": [10**400, 2, 3]}) is None and of_comments([COMMENT + "[" * 100_000]) is None
     write_coordinates(tmp_path, None)
     assert read_coordinates(tmp_path) is None

@@ -294,6 +294,8 @@ def test_worlds_are_separate_calls_into_one_array(device):
         tape.rasterize(*arrays.values(), scene.camera, options={}, hidden_from=wp.from_torch(surface[0]))
     with pytest.raises(InputError, match="cameras: expected a sequence"):
         tape.rasterize_worlds(*given, cameras=scene.camera)
+    with pytest.raises(InputError, match="got 'array'"):
+        tape.rasterize(*arrays.values(), scene.camera, out=images)
     wrong = {"image": r"out\['image'\]: expected .* got \[3, 3, 3\]", "depth": "some of image, alpha, got 'depth'"}
     for name, sentence in wrong.items():
         with pytest.raises(InputError, match=sentence):

@@ -115,10 +115,11 @@ def rasterize(
                 leaf.requires_grad_(recorded and named[name].requires_grad)
         found = _render(leaves, named, camera, background, adjoint, options)
         shown = {name: tensor for name in PIXELS if (tensor := getattr(found, name)) is not None}
-        if unknown := {name for name, room in (out or {}).items() if room is not None} - set(shown):
+        rooms = {} if out is None else out if isinstance(out, Mapping) else {type(out).__name__: out}
+        if unknown := {name for name, room in rooms.items() if room is not None} - set(shown):
             raise InputError(f"out: expected some of {', '.join(shown)}, got {min(map(str, unknown))!r}; omit it.")
         with stage("tape"):
-            pixels = {name: _array(name, tensor, recorded, (out or {}).get(name)) for name, tensor in shown.items()}
+            pixels = {name: _array(name, tensor, recorded, rooms.get(name)) for name, tensor in shown.items()}
             if recorded:
                 inputs = [(array, leaves[name]) for name, array in named.items() if array.requires_grad]
                 outputs = [(pixels[name], tensor) for name, tensor in shown.items() if tensor.requires_grad]

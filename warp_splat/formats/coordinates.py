@@ -57,7 +57,7 @@ def of_comments(comments: Sequence[str]) -> dict | None:
     text = next((comment for comment in comments if comment.startswith(COMMENT)), COMMENT)
     try:
         return kept(json.loads(text.removeprefix(COMMENT)))
-    except ValueError:
+    except (ValueError, RecursionError):
         return None
 
 
@@ -69,9 +69,9 @@ def checked(found: object) -> dict:
     """
     if not isinstance(found, dict) or not isinstance(origin := found.get("origin"), list) or len(origin) != 3:
         raise Unexpected("no origin of three numbers")
-    residuals, left_out = found.get("residuals", {}), found.get("left_out", [])
-    if not isinstance(residuals, dict) or not isinstance(left_out, list):
-        raise Unexpected("residuals, or what was left out, that are not by name")
+    residuals, *_ = told = found.get("residuals", {}), found.get("left_out", []), found.get("reference")
+    if not all(map(isinstance, told, (dict, list, str | None))):
+        raise Unexpected("residuals or what was left out that are not by name, or a reference that is no text")
     if not all(type(n) in (int, float) and np.isfinite(float(n)) for n in (*origin, *residuals.values())):
         raise Unexpected("what is no finite number")
     return found

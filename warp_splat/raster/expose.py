@@ -60,8 +60,7 @@ def _through_grid(image: torch.Tensor, numbers: torch.Tensor, pivot: float) -> t
     rows, columns = ((torch.arange(n, device=image.device) + 0.5) * (2.0 / n) - 1.0 for n in (height, width))
     places = torch.stack([columns.expand(height, width), rows[:, None].expand(height, width), brightness], -1)
     n = functional.grid_sample(numbers[None], places[None, None], padding_mode="border", align_corners=True)[0, :, 0]
-    changes = [(n[k] * r + n[3 + k] * g) + (n[6 + k] * b + n[9 + k]) for k in range(3)]
-    return image + torch.stack(changes, -1)
+    return image + torch.stack([(n[k] * r + n[3 + k] * g) + (n[6 + k] * b + n[9 + k]) for k in range(3)], -1)
 
 
 class _ColorMap(torch.autograd.Function):
