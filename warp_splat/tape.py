@@ -191,8 +191,7 @@ def _render(leaves: dict[str, torch.Tensor], named: dict[str, wp.array], camera,
     sh = leaves["sh"] if "sh" in leaves else (leaves["sh[0]"], leaves["sh[1]"])
     if "background" in leaves:
         background = leaves["background"].flatten()
-    learned = {name: leaves[name].flatten() for name in ("twist", "intrinsics") if name in leaves}
-    if learned:
+    if learned := {name: leaves[name].flatten() for name in ("twist", "intrinsics") if name in leaves}:
         camera = CameraParameters(camera, **learned)
     gaussians = (leaves["means"], quats, leaves["scales"], leaves["opacities"], sh)
     return api.rasterize(*gaussians, camera, background, adjoint, options, leaves.get("features"))

@@ -121,8 +121,7 @@ def _columns(tables: PlyTables, element: str, names: Sequence[str], code: str) -
     if element not in tables.elements:
         raise Unexpected(f"a compressed one without an element {element!r}")
     properties = tables.elements[element].properties
-    wrong = [name for name in names if properties.get(name) != code]
-    if wrong:
+    if wrong := [name for name in names if properties.get(name) != code]:
         raise Unexpected(f"a compressed one whose {element} lacks {', '.join(wrong):.200} of type {code}")
     return columns_of(tables.rows(element), names, code)
 

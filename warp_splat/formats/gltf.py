@@ -81,8 +81,7 @@ def load_gltf(path: str | Path, report: Report = print) -> SplatFile:
     with reading(path, "a glTF 2.0 file of Gaussians (KHR_gaussian_splatting)"):
         document = Document(path)
         required = entries_of(document.json, "extensionsRequired")
-        unknown = [name for name in required if not isinstance(name, str) or name not in UNDERSTOOD]
-        if unknown:
+        if unknown := [name for name in required if not isinstance(name, str) or name not in UNDERSTOOD]:
             raise Unexpected(f"one that needs the extension {unknown[0]!r:.80}; export it without")
         placed = [(piece, world) for mesh, world in document.placed_meshes() for piece in _splat_primitives(mesh)]
         if not 0 < len(placed) <= MOST_PIECES:
@@ -173,8 +172,7 @@ def _read_primitive(document: Document, primitive: dict, report: Report) -> Spla
         raise Unexpected(f"a primitive with {coefficients} coefficients of SH, not 1, 4, 9 or 16")
     kinds = {"POSITION": "VEC3", f"{NAME}:ROTATION": "VEC4", f"{NAME}:SCALE": "VEC3", f"{NAME}:OPACITY": "SCALAR"}
     kinds |= dict.fromkeys(_harmonic_names(coefficients), "VEC3")
-    missing = [name for name in kinds if name not in attributes]
-    if missing:
+    if missing := [name for name in kinds if name not in attributes]:
         raise Unexpected(f"a primitive that lacks {', '.join(missing)}")
     arrays = [document.accessor(attributes[name], kind) for name, kind in kinds.items()]
     if len({len(array) for array in arrays}) > 1:

@@ -141,8 +141,7 @@ def load_ply(path: str | Path, report: Report = print) -> SplatFile:
                 "export the Gaussians with a degree of at most 3."
             )
         columns = (POSITION, F_DC, _rest_names(rest_count), ("opacity",), SCALE, ROTATION)
-        missing = [name for group in columns for name in group if name not in names]
-        if missing:
+        if missing := [name for group in columns for name in group if name not in names]:
             raise InputError(
                 f"{path}: expected a PLY file of 3D Gaussians, but the properties {', '.join(missing)} are "
                 "missing; export it as 'PLY (standard)' or train again."

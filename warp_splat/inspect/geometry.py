@@ -68,8 +68,7 @@ def check_reprojection(subject: Subject) -> Iterator[Finding]:
         level, meaning = "warning", ": views will blur, since the cameras are imprecise"
     text = f"median {typical:.2f} px over {len(every)} observations in {len(medians)} images of {width:.0f} px"
     yield Finding("reprojection", level, f"{text}{meaning}.")
-    worst = [n for n in sorted(medians, key=lambda n: -medians[n]) if medians[n] > max(WORSE * typical, 1.0)]
-    if worst:
+    if worst := [n for n in sorted(medians, key=lambda n: -medians[n]) if medians[n] > max(WORSE * typical, 1.0)]:
         text = few(f"{name} ({medians[name]:.1f} px)" for name in worst)
         yield Finding("reprojection", "warning", f"{len(worst)} images are much worse than the others: {text}.")
 

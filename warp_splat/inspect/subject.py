@@ -94,8 +94,7 @@ def _read_colmap(subject: Subject) -> Iterator[Finding]:
     subject.model = models[largest]
     xyz = np.array([point.xyz for point in subject.model.points3D.values()], np.float64).reshape(-1, 3)
     subject.points = xyz[(np.abs(xyz) <= np.finfo(np.float32).max).all(axis=1)]
-    odd = len(xyz) - len(subject.points)
-    if odd:
+    if odd := len(xyz) - len(subject.points):
         yield Finding("points", "warning", f"{odd} of {len(xyz)} are not finite in 32 bits; training leaves them out.")
     yield from _match_files(subject)
 

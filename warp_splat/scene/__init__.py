@@ -137,8 +137,7 @@ def require_unmasked(count: int, black: int, source: str | Path) -> None:
 def require_one_kind(photographs: list[tuple[str, bool]], source: str | Path) -> None:
     """Refuse photographs, by name and whether they are in linear light, of which some are and some are not."""
     name, linear = photographs[0]
-    odd = [other for other, kind in photographs if kind != linear]
-    if odd:
+    if odd := [other for other, kind in photographs if kind != linear]:
         kinds = ("in linear light", "as a screen shows it")
         here, there = kinds if linear else kinds[::-1]
         raise InputError(
@@ -171,8 +170,7 @@ def read_photos(
     expected = f"expected a scene with cameras, a COLMAP model (sparse/), {transforms.TRAIN} or {transforms.ALL}"
     if (source / "point_cloud").is_dir():
         raise InputError(f"{source}: {expected}, found a trained model; give the folder of its scene.")
-    photographs = find_files(photo_root(source), PHOTOS)
-    if photographs:
+    if photographs := find_files(photo_root(source), PHOTOS):
         raise InputError(f"{source}: {expected}, found {len(photographs)} photographs alone; {sfm_hint(source)}")
     others = find_files(photo_root(source), OTHER_PHOTOS)
     hint = f"convert its {len(others)} files such as {others[0]!r} to JPEG or PNG" if others else "give another folder"

@@ -117,12 +117,10 @@ def merge_blocks(config: MergeConfig) -> int:
     for place, block, options in zip(places, blocks, trained, strict=True):
         cells = {"number of blocks": len(block.cells), "cells": block.cells.tolist()}
         kinds.append({**cells, **{name: options.get(name) for name in COMMON}})
-        other = [name for name, value in kinds[-1].items() if value != kinds[0][name]]
-        if other:
+        if other := [name for name, value in kinds[-1].items() if value != kinds[0][name]]:
             raise InputError(f"{place}: expected the {other[0]} of {places[0]}, found another; move one of them away.")
     numbers, count = [block.number for block in blocks], len(blocks[0].cells)
-    wrong = [f"{numbers.count(n)} of block {n + 1}/{count}" for n in range(count) if numbers.count(n) != 1]
-    if wrong:
+    if wrong := [f"{numbers.count(n)} of block {n + 1}/{count}" for n in range(count) if numbers.count(n) != 1]:
         raise InputError(f"{folder}: expected one ended training of each block, found {', '.join(wrong)}.")
     path = ply_path(folder, max(iteration for iteration, _ in models))
     splats, points, colors, cameras = [], [], [], {}

@@ -197,8 +197,7 @@ def _photos(
     paths = ImageFinder(root).find_all(names, f"images of {where}", hint, report)
     sizes = [images.read_size(path) for path in paths]
     photos = [photo_of(*each, sampling) for each in zip(registered, paths, sizes, strict=True)]
-    scaled = sum(size != size_of(image) for size, image in zip(sizes, registered, strict=True))
-    if scaled:
+    if scaled := sum(size != size_of(image) for size, image in zip(sizes, registered, strict=True)):
         report(f"Scaling the cameras of {scaled} of {len(photos)} images to the size of the files in {root.name}.")
     tell_lenses(photos, report)
     return photos

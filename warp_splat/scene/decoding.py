@@ -55,8 +55,7 @@ def load_views(
     ]
     fits = memory is None or sum(sizes) <= memory
     read = lru_cache(None if fits else RECENT)(lambda p: decode(p, cameras[p], white_background, invert_masks))
-    at_once = memory is None or (fits and sum(p.camera.width * p.camera.height for p in photos) <= AT_ONCE)
-    if at_once:
+    if at_once := memory is None or (fits and sum(p.camera.width * p.camera.height for p in photos) <= AT_ONCE):
         with ThreadPoolExecutor(THREADS) as pool:
             list(pool.map(read, photos))
     stored = {photo: Stored(partial(read, photo), *kinds[photo]) for photo in photos}

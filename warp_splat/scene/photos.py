@@ -103,8 +103,7 @@ class ImageFinder:
             InputError: if one is missing, or as :meth:`find`; ``what`` they are, and a ``hint`` what to do.
         """
         files = {name: self.find(name) for name in names}
-        missing = [name for name, file in files.items() if file is None]
-        if missing:
+        if missing := [name for name, file in files.items() if file is None]:
             raise InputError(
                 f"{self.root}: expected the {len(names)} {what}, but {len(missing)} of them cannot be found, the first "
                 f"is {missing[0]!r:.200}; {hint}."

@@ -115,8 +115,7 @@ def _split(
     if odd or not to_train:
         problem = f"{min(odd)!r:.200} has no frame or is in two" if odd else "none is left to train on"
         raise InputError(f"{path}: expected lists of names that part the frames, but {problem}; correct the file.")
-    unused = len({*names} - to_train - held_out)
-    if unused:
+    if unused := len({*names} - to_train - held_out):
         report(f"Leaving out {unused} of {len(names)} images that {path.name} neither trains nor tests on.")
     pick = lambda chosen: [photo for name, photo in photos.items() if name in chosen]  # noqa: E731
     return pick(to_train), pick(held_out)

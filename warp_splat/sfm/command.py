@@ -251,8 +251,7 @@ def _summarize(scene: Path, summary: dict[str, Any]) -> None:
     for what in ("unreadable", "unregistered"):
         if names := summary[what]:
             print(f"  {what}: {few(names)}")
-    others = summary["registered_by_model"][1:]
-    if others:
+    if others := summary["registered_by_model"][1:]:
         print(f"  the photographs fall apart into {len(others) + 1} models; others have {', '.join(map(str, others))}")
     if registered < FEW * count:
         print(f"  warning: only {registered} of {count} photographs registered; {ADVICE}.")

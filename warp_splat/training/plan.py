@@ -147,8 +147,7 @@ def comparable(table: Sequence[Reached], config: TrainConfig, task: Task) -> str
     """A sentence: what scenes of about this size reached by about as many steps, or what the table has else."""
     steps = config.learn.iterations
     alike = lambda one, other: max(one, other) <= LIKE * min(one, other)  # noqa: E731
-    near = [entry for entry in table if alike(entry.pixels, task.pixels) and alike(entry.iterations, steps)]
-    if near:
+    if near := [entry for entry in table if alike(entry.pixels, task.pixels) and alike(entry.iterations, steps)]:
         told = (f"{entry.psnr:.1f} dB ({entry.scene}, {entry.iterations} steps)" for entry in near)
         return f"Comparable trainings reached {', '.join(told)} on held-out views; another scene is another matter."
     told = (f"{e.scene}, {e.pixels / 1e6:.2f} megapixels, {e.iterations} steps: {e.psnr:.1f} dB" for e in table)
