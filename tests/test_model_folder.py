@@ -219,6 +219,8 @@ def test_open_model(tmp_path, mark, monkeypatch, fails, capsys):
     model_folder.write_cfg_args(folder, trained | {"eval": False})
     write_coordinates(folder, {"origin": [1.0, 2.0, 3.0]})
     assert model_folder.open_model(folder, 3)[::2] == (3, trained | {"eval": False})
+    monkeypatch.chdir(model_folder.ply_path(folder, 3).parent)
+    assert model_folder.open_model("point_cloud.ply")[::2] == (0, trained | {"eval": False})
     assert main(["convert", str(folder), str(target)]) == 0 and load_gaussians(target).antialiased != mark
     said = capsys.readouterr().out
     for lost in ("in the world", "in linear light", "projection (ellipsoid)", "white background"):
@@ -228,4 +230,7 @@ def test_open_model(tmp_path, mark, monkeypatch, fails, capsys):
     assert load_start(str(folder), print)[0].linear  # so that training can warn
     (folder / "coordinates.json").write_text("{")
     assert model_folder.open_model(folder, 3)[0] == 3 and "coordinates.json" in fails("convert", folder, target)
+    model_folder.write_cfg_args(folder, {"projection": "fisheye"})
+    message = fails("render", "-m", folder)
+    assert "cfg_args: expected a projection of affine, ellipsoid, unscented, found another" in message
     assert drawn[1].linear and drawn[1].coordinates["origin"] == [1.0, 2.0, 3.0] and drawn[2]["linear_light"]

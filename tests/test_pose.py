@@ -178,13 +178,16 @@ def trained(tmp_path_factory):
         yield folder
 
 
-def test_render_knows_the_cameras(trained, capsys):
+@pytest.mark.parametrize("file", ["", "point_cloud/iteration_24/point_cloud.ply"])
+def test_render_knows_the_cameras(trained, capsys, file):
+    """Also where only the file is named, which lies in the folder; its images go beside it."""
+    folder, name = (trained / f"{file}.renders", "ours_0") if file else (trained, "ours_24")
     trained_results = json.loads((trained / "results.json").read_text())["ours_24"]
     assert trained_results["PSNR_POSE"] >= trained_results["PSNR"]
     assert "PSNR_POSE" in (trained / "per_view.md").read_text()
-    assert main(["render", "-m", str(trained), "--skip_train"]) == 0
-    assert "refined in iteration 24" in capsys.readouterr().out
-    results = json.loads((trained / "results.json").read_text())["ours_24"]
+    assert main(["render", "-m", str(trained / file), "--skip_train"]) == 0
+    assert "cameras are those of the model, which were refined" in capsys.readouterr().out
+    results = json.loads((folder / "results.json").read_text())[name]
     for name in ("PSNR", "SSIM"):
         assert results[name] == pytest.approx(trained_results[name], abs=1e-3), name
     assert results["PSNR_POSE"] >= results["PSNR"]

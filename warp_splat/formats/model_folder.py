@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from warp_splat.camera import Camera
+from warp_splat.config import PROJECTIONS
 from warp_splat.errors import InputError, refusing
 from warp_splat.formats.exchange import FORMATS, load_gaussians
 from warp_splat.formats.files import T, Unexpected, read_json, write_text
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
 
 CAMERAS = "cameras.json"
 ENVIRONMENT = "environment.json"
+AS_SAVED = "point_cloud/iteration_*/point_cloud.ply"
 
 
 def default_model_path() -> Path:
@@ -131,25 +133,31 @@ def is_file_of_gaussians(path: str | Path) -> bool:
     return path.is_file() or (not path.exists() and path.suffix.lower() in FORMATS)
 
 
+def gaussians_file(path: str | Path, iteration: int) -> Path:
+    """Where the Gaussians of a model folder are, or this file."""
+    return Path(path) if is_file_of_gaussians(path) else ply_path(path, iteration)
+
+
 def open_model(
     path: str | Path, iteration: int = -1, crop: Sequence[float] = (), report: Report = print
 ) -> tuple[int, SplatFile, dict]:
     """The iteration, the Gaussians and the options of the training, from a model folder or a file of Gaussians.
 
     Of a file, the iteration is 0. Where there is no cfg_args, the options are that every 8th view was held out, and
-    what the file tells. ``crop`` as :func:`warp_splat.formats.splats.cropped` takes it, ``report`` as
+    what the file tells; a file where training puts it has those of its folder. ``crop`` as
+    :func:`warp_splat.formats.splats.cropped` takes it, ``report`` as
     :func:`warp_splat.formats.exchange.load_gaussians`.
 
     Raises:
-        InputError: if there is no such model, or it cannot be read.
+        InputError: if there is no such model, it cannot be read, or was trained with an unknown projection.
     """
-    path, options = Path(path), {"eval": True}
-    if is_file_of_gaussians(path):
-        iteration, found = 0, load_gaussians(path, report)
-    else:
-        iteration = find_iteration(path, iteration)
-        found = load_gaussians(ply_path(path, iteration), report)
-        options = read_cfg_args(path) if (path / "cfg_args").exists() else options
+    path = Path(path)
+    iteration = 0 if is_file_of_gaussians(path) else find_iteration(path, iteration)
+    found = load_gaussians(gaussians_file(path, iteration), report)
+    args = (path.absolute().parents[2] if path.absolute().match(AS_SAVED) else path) / "cfg_args"
+    options = read_cfg_args(args.parent) if args.exists() else {"eval": True}
+    if options.get("projection", PROJECTIONS[0]) not in PROJECTIONS:
+        raise InputError(f"{args}: expected a projection of {', '.join(PROJECTIONS)}, found another; correct it there.")
     options = {"antialiasing": found.antialiased, "linear_light": found.linear, **options}
     marks = {"antialiased": bool(options["antialiasing"]), "linear": bool(options["linear_light"])}
     return iteration, found._replace(splats=cropped(found.splats, crop), **marks), options
@@ -243,6 +251,16 @@ def read_cameras(folder: str | Path) -> list[tuple[str, Camera]]:
     return read_json(path, "a list of cameras as training writes it", parse) if path.exists() else []
 
 
+def read_refined(path: str | Path, iteration: int) -> dict[str, Camera]:
+    """The cameras that were learned with the Gaussians of a model folder, or of a file in one, by name; mostly none.
+
+    Raises:
+        InputError: if the file is damaged.
+    """
+    place = gaussians_file(path, iteration).absolute()
+    return dict(read_cameras(place.parent)) if place.match(AS_SAVED) else {}
+
+
 def write_environment(ply: Path, harmonics: np.ndarray | None) -> None:
     """Beside a model's Gaussians, write what lies behind them: coefficients as those of a Gaussian, [16, 3], or None.
 
@@ -286,7 +304,7 @@ def read_beside(path: str | Path, iteration: int, name: str, expected: str, pars
     Raises:
         InputError: if the file is damaged, or another than ``expected``.
     """
-    beside = (Path(path) if is_file_of_gaussians(path) else ply_path(path, iteration)).parent / name
+    beside = gaussians_file(path, iteration).parent / name
     return read_json(beside, expected, parse) if beside.exists() else None
 
 

@@ -14,7 +14,7 @@ from warp_splat.camera import Camera
 from warp_splat.config import ConvertConfig, RasterOptions
 from warp_splat.errors import InputError
 from warp_splat.formats.exchange import format_of, load_gaussians, save_gaussians
-from warp_splat.formats.model_folder import is_file_of_gaussians, ply_path
+from warp_splat.formats.model_folder import gaussians_file
 from warp_splat.formats.splats import COEFFICIENTS, SplatArrays
 from warp_splat.formats.stored import LOG_SCALES, SH_C0, sigmoid, unit_quats
 from warp_splat.gaussians import GaussianModel
@@ -37,7 +37,7 @@ def convert(config: ConvertConfig) -> int:
     """
     format_of(config.target)  # before anything is read
     finished = Finished(config.source, crop=config.crop)
-    source = config.source if is_file_of_gaussians(config.source) else ply_path(config.source, finished.iteration)
+    source = gaussians_file(config.source, finished.iteration)
     if os.path.exists(config.target) and os.path.samefile(source, config.target):
         raise InputError(f"{config.target}: expected another file than the source; name a new one.")
     notes: list[str] = []

@@ -183,15 +183,13 @@ def _memory_explained(device: torch.device, model: GaussianModel, scene: Scene |
 def _open(config: RenderConfig) -> tuple[Path, Finished]:
     """The folder for the images, and the model.
 
-    A file of Gaussians has no folder and no training: its images go beside it, every 8th view is held out.
+    The images of a file of Gaussians go beside it.
     """
     if not config.model_path:
         raise InputError("-m: expected the folder of a trained model; train.py prints it at its end.")
     path = Path(config.model_path)
-    is_file = model_folder.is_file_of_gaussians(path)
-    if is_file and not config.source_path and _needs_scene(config):
-        raise InputError(f"{path}: a file says nothing of cameras; name the scene with -s, or use --orbit.")
-    return Path(f"{path}.renders") if is_file else path, Finished(path, config.iteration)
+    folder = Path(f"{path}.renders") if model_folder.is_file_of_gaussians(path) else path
+    return folder, Finished(path, config.iteration)
 
 
 def _cameras(config: RenderConfig, scene: Scene | None) -> list[Camera]:

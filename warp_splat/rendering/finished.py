@@ -10,11 +10,11 @@ import torch
 
 from warp_splat.camera import Camera
 from warp_splat.color import to_bytes
-from warp_splat.config import PROJECTIONS, RasterOptions
+from warp_splat.config import RasterOptions
 from warp_splat.errors import InputError
 from warp_splat.formats.coordinates import read_coordinates
 from warp_splat.formats.exposures import Exposures, read_exposures
-from warp_splat.formats.model_folder import is_file_of_gaussians, open_model, ply_path, read_cameras, read_environment
+from warp_splat.formats.model_folder import is_file_of_gaussians, open_model, read_environment, read_refined
 from warp_splat.formats.splats import SplatFile
 from warp_splat.gaussians import GaussianModel
 from warp_splat.raster.api import RenderOutput
@@ -53,9 +53,8 @@ class Finished:
     @property
     def options(self) -> RasterOptions:
         """How it is rendered."""
-        found = RasterOptions(antialiasing=bool(self.trained.get("antialiasing")))
-        projection = self.trained.get("projection")
-        return replace(found, projection=projection) if projection in PROJECTIONS else found
+        projection = str(self.trained.get("projection", RasterOptions.projection))
+        return RasterOptions(antialiasing=bool(self.trained.get("antialiasing")), projection=projection)
 
     def placed(self) -> SplatFile:
         """Its Gaussians, and where they are in the world. Raises InputError if ``coordinates.json`` is damaged."""
@@ -68,7 +67,7 @@ class Finished:
         owed = {
             "what was learned behind the Gaussians (--parts sky)": self.harmonics is not None,
             "that a white background was behind them": bool(self.trained.get("white_background")),
-            f"their projection ({self.options.projection})": self.options.projection != RasterOptions().projection,
+            f"their projection ({self.options.projection})": self.options.projection != RasterOptions.projection,
         }
         return [f"{what}, which no format has" for what, owes in owed.items() if owes]
 
@@ -126,7 +125,7 @@ class Finished:
         Raises:
             InputError: if the scene has changed since the training.
         """
-        cameras = dict(read_cameras(ply_path(self.path, self.iteration).parent))
+        cameras = read_refined(self.path, self.iteration)
         if not cameras:
             return scene
         train, test = ([self._refined(view, cameras) for view in views] for views in (scene.train, scene.test))
