@@ -23,7 +23,7 @@ from browser import CHROMIUM
 from warp_splat.audit import program
 from warp_splat.audit.judged import RUNS, exact_image, measure
 from warp_splat.audit.probes import FOCAL, GREEN, NEARLY_ROUND
-from warp_splat.audit.renderer import Answer, Renderer, function_of
+from warp_splat.audit.renderer import Answer, Renderer, _draw, function_of
 from warp_splat.audit.rules import find_rules
 from warp_splat.audit.small_scenes import SCENES, on_all_pixels
 from warp_splat.cli import main
@@ -139,6 +139,14 @@ def test_what_hangs_dies_or_draws_nothing_gets_a_row(importable, function, says)
     assert {row.level for row in rows} <= {"warning", "error"}
 
 
+def test_parameters_of_the_renderer_itself_want_no_gradients():
+    own = torch.ones(3, requires_grad=True)
+    image, gradients = _draw(
+        lambda *given: own * torch.ones(2, 2, 3), [np.zeros((1, 1, 3), np.float32)] * 7, None, None
+    )
+    assert image.shape == (2, 2, 3) and not gradients
+
+
 @pytest.mark.slow
 def test_what_dies_between_two_answers_ends_no_audit(importable):
     renderer = Renderer("wrong_renderer:dies_later")
@@ -243,9 +251,13 @@ def test_a_program_may_write_an_exr(tmp_path):
         (["audit_targets.own:manual", "--case", "nothing"], "expected one of one, two"),
         (["audit_targets.own:manual", "--case", "one", "--limit", "nan"], "--limit: expected a finite number"),
         (["audit_targets.own:manual", "--case", "one", "--degree", "9"], "--degree: expected 0 to 3, got 9"),
+        (["audit_targets.own:manual", "-o", __file__], "expected a folder that can be written"),
+        (["exits:draw"], "that can be imported, found SystemExit(3)"),
     ],
 )
-def test_bad_input_is_one_sentence(arguments, says, capsys):
+def test_bad_input_is_one_sentence(arguments, says, capsys, tmp_path, monkeypatch):
+    (tmp_path / "exits.py").write_text("raise SystemExit(3)")
+    monkeypatch.syspath_prepend(tmp_path)
     assert main(["audit", *arguments]) == 1
     assert says in capsys.readouterr().err
 

@@ -222,3 +222,6 @@ def test_damaged_coordinates_get_one_sentence(tmp_path):
     assert kept({"origin": [10**400, 2, 3]}) is None and of_comments([COMMENT + "[" * 100_000]) is None
     write_coordinates(tmp_path, None)
     assert read_coordinates(tmp_path) is None
+    (tmp_path / "coordinates.json").mkdir()
+    with pytest.raises(InputError, match=r"coordinates\.json"):
+        read_coordinates(tmp_path)

@@ -19,6 +19,7 @@ from warp_splat.config import AuditConfig
 from warp_splat.errors import InputError
 from warp_splat.evaluation.report import machine
 from warp_splat.formats.files import write_array, write_json
+from warp_splat.formats.model_folder import prepare_folder
 from warp_splat.formats.png import save_png
 from warp_splat.inspect.page import address_of, write_page
 from warp_splat.inspect.subject import Finding
@@ -39,7 +40,7 @@ def audit(config: AuditConfig) -> int:
     draw_by_program(place) if config.program else function_of(place)
     if config.case and config.case not in SCENES:
         raise InputError(f"--case {config.case}: expected one of {', '.join(SCENES)}.")
-    out = Path(config.out)
+    out = prepare_folder(config.out)
     with closing(Renderer(place, config.limit)) as renderer:
         if config.case:
             return _write_case(renderer, config.degree, config.case, out)
@@ -105,7 +106,6 @@ def _write_case(renderer: Renderer, degree: int, name: str, out: Path) -> int:
     except RendererFailed as error:
         print(f"{name}: the renderer {error}.")
         answer = None
-    out.mkdir(parents=True, exist_ok=True)
     write_files(out, stored(*workload.gaussians[:4], workload.gaussians.sh), workload.camera)
     expected = exact_image(workload)
     write_array(out / "expected.npy", expected)

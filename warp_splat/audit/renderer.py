@@ -105,8 +105,8 @@ def function_of(place: str):
     module, _, name = place.partition(":")
     try:
         function = getattr(importlib.import_module(module), name)
-    except Exception as error:  # whatever a module of others does when it is imported
-        raise InputError(f"{place}: expected MODULE:function that can be imported, found {error}.") from error
+    except (Exception, SystemExit) as error:  # whatever a module of others does when it is imported
+        raise InputError(f"{place}: expected MODULE:function that can be imported, found {error!r}.") from error
     if not callable(function):
         raise InputError(f"{place}: expected a function, found {type(function).__name__}.")
     return function
@@ -145,7 +145,7 @@ def _draw(render, given: list[np.ndarray], camera, upstream: np.ndarray | None):
     sh = torch.cat([sh_dc, sh_rest], 1)
     leaves = [tensor.requires_grad_(upstream is not None) for tensor in (*geometry, sh, background)]
     image = render(*leaves[:5], camera, background)
-    if not isinstance(image, torch.Tensor) or not image.requires_grad:
+    if upstream is None or not isinstance(image, torch.Tensor) or not image.requires_grad:
         return np.asarray(image.detach().cpu() if isinstance(image, torch.Tensor) else image), {}
     found = torch.autograd.grad(image, leaves, torch.from_numpy(upstream).to(image), allow_unused=True)
     named = zip(PARAMETERS, found, strict=False)

@@ -27,7 +27,7 @@ def read_coordinates(folder: str | Path) -> dict | None:
         InputError: if it has no origin of three finite numbers.
     """
     path = Path(folder) / FILE
-    return read_json(path, "coordinates as `warp-splat sfm` writes them", checked) if path.is_file() else None
+    return read_json(path, "coordinates as `warp-splat sfm` writes them", checked) if path.exists() else None
 
 
 def write_coordinates(folder: str | Path, coordinates: dict | None) -> None:
