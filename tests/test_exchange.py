@@ -387,7 +387,11 @@ def test_convert_bounds_what_pictures_lose(tmp_path, capsys, ending):
 
 @pytest.mark.parametrize(
     ("options", "sentence"),
-    [("--orbit --bound", "--bound: expected views"), ("--device cpu", "name the scene with -s")],
+    [
+        ("--orbit --bound", "--bound: expected views"),
+        ("--video path --orbit_center origin", "--orbit_center origin: expected --orbit or --video orbit"),
+        ("--device cpu", "name the scene with -s"),
+    ],
 )
 def test_what_render_makes_of_a_file_alone(tmp_path, fails, options, sentence):
     save_gaussians(tmp_path / "a.spz", some_file(100))

@@ -64,6 +64,17 @@ def test_a_ball():
     np.testing.assert_allclose(found.colors, np.float32([[0.2, 0.5, 0.8]]).repeat(len(found.colors), 0), atol=1e-5)
 
 
+def test_a_ball_far_from_the_origin():
+    """More than 2^20 voxels: float32 has no more digits than these, and its surface no folds."""
+    far = np.array([0.0, 1_300_000 * VOXEL, 0.0])
+    views = [ball(index) for index in range(VIEWS)]
+    moved = [replace(view.camera, translation=view.camera.translation - view.camera.rotation @ far) for view in views]
+    found = surface([view._replace(camera=camera) for view, camera in zip(views, moved, strict=True)])
+    assert np.abs(np.linalg.norm(found.vertices - far, axis=1) - 1).max() < VOXEL
+    mesh = trimesh.Trimesh(found.vertices, found.faces, process=False)
+    assert mesh.is_winding_consistent and mesh.volume == pytest.approx(4 / 3 * np.pi, rel=0.03)
+
+
 def test_a_disc_is_where_rays_meet_its_plane():
     camera = Camera(64, 48, 80, 85, 30, 25, np.eye(3), np.array([0, 0, DISTANCE]))
     turn = Rotation.from_euler("xyz", [30, 40, 0], degrees=True)
@@ -288,8 +299,9 @@ def test_convex_pieces(model, scene, tmp_path, ending):
     ("arguments", "said"),
     [
         (["ball.stl"], "expected a name that ends in .ply, .glb, .obj"),
-        (["pyproject.toml/ball.ply"], "expected a folder that can be written"),
+        (["file/ball.ply"], "expected a folder that can be written"),
         (["ball.ply", "--collision", "9999999999999999999"], "--collision: expected 0 to 1000000"),
+        (["ball.ply", "--collision", "2"], "ball_collision.ply: expected the name of a file to write, found a folder"),
         (["ball.ply", "--voxel", "-1"], "--voxel: expected a finite number"),
         (["ball.ply", "--voxel", "0.005", "--memory", "0.15"], "raise it, or --memory"),
         (["ball.ply", "--watertight", "--triangles", "9"], "--triangles: simplifying would open what"),
@@ -299,7 +311,10 @@ def test_convex_pieces(model, scene, tmp_path, ending):
         (["mesh.ply", "--memory", "1e-9"], "--memory: views of 16 px and more do not fit"),
     ],
 )
-def test_sentences(model, scene, capsys, monkeypatch, arguments, said):
+def test_sentences(model, scene, capsys, monkeypatch, tmp_path, arguments, said):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "ball_collision.ply").mkdir()
+    (tmp_path / "file").touch()
     monkeypatch.delattr("warp_splat.meshing.command.filled")  # said before photographs are compared, which takes long
     assert main(["mesh", str(model[0]), *arguments, "-s", scene]) != 0
     assert said in capsys.readouterr().err

@@ -230,6 +230,9 @@ def test_open_model(tmp_path, mark, monkeypatch, fails, capsys):
     assert load_start(str(folder), print)[0].linear  # so that training can warn
     (folder / "coordinates.json").write_text("{")
     assert model_folder.open_model(folder, 3)[0] == 3 and "coordinates.json" in fails("convert", folder, target)
+    model_folder.write_cfg_args(folder, {"projection": "unscented"})
+    assert main(["export-html", str(folder), str(tmp_path / "a.html")]) == 0
+    assert "not by the unscented one" in capsys.readouterr().out
     model_folder.write_cfg_args(folder, {"projection": "fisheye"})
     message = fails("render", "-m", folder)
     assert "cfg_args: expected a projection of affine, ellipsoid, unscented, found another" in message

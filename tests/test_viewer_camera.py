@@ -43,6 +43,9 @@ def test_camera_of_a_browser():
         {"fov": np.nan},
         {"width": 0},
         {"height": 0},
+        {"width": 1e300},
+        {"wxyz": np.ones(3)},
+        {"position": np.zeros(2)},
     ],
 )
 def test_what_is_no_camera(change):

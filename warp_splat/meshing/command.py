@@ -47,6 +47,9 @@ def mesh(config: MeshConfig) -> int:
     if output.suffix.lower() not in ENDINGS:
         raise InputError(f"{output}: expected a name that ends in {', '.join(ENDINGS)}; rename it.")
     check_output(output)
+    pieces_place = output.with_name(f"{output.stem}_collision{output.suffix}")
+    if config.collision:
+        check_output(pieces_place)
     if config.triangles and config.watertight:
         raise InputError("--triangles: simplifying would open what --watertight closes; take larger voxels (--voxel).")
     for package, wanted in (("trimesh", True), ("fast_simplification", config.triangles), ("vhacdx", config.collision)):
@@ -78,9 +81,8 @@ def mesh(config: MeshConfig) -> int:
     print(f"{output}: {len(surface.faces)} of {found} triangles{least}, voxels of {voxel:.4g}")
     if config.collision:
         pieces = needed("trimesh").Scene(whole.convex_decomposition(maxConvexHulls=config.collision))  # V-HACD
-        place = output.with_name(f"{output.stem}_collision{output.suffix}")
-        write_bytes(place, exported(pieces, place.suffix))
-        print(f"{place}: {len(pieces.geometry)} convex pieces")
+        write_bytes(pieces_place, exported(pieces, output.suffix))
+        print(f"{pieces_place}: {len(pieces.geometry)} convex pieces")
     return 0
 
 

@@ -173,6 +173,8 @@ def surface_of(voxels: torch.Tensor, views: Sequence[Drawn], voxel: float, water
     if watertight and (distances.abs() < 1).any():
         voxels, distances, colors = closed(voxels, distances, colors)
     known = (~torch.isnan(distances)).nonzero()[:, 0]
+    first = voxels[:1]  # from there, codes differ and float32 is exact, wherever the scene is
+    voxels = voxels - first
     codes, order = torch.sort(code(voxels[known]))
     voxels, distances, colors = (values[known[order]] for values in (voxels, distances, colors))
     corners = []
@@ -184,6 +186,6 @@ def surface_of(voxels: torch.Tensor, views: Sequence[Drawn], voxel: float, water
     cells = (values.amin(1) < 0) & (values.amax(1) >= 0)  # false where one is not a number
     places, values = voxels[cells].numpy(), values[cells].numpy()
     points, faces = sparse_marching_cubes_from_cells(places, values, device="cpu")
-    points = points.numpy().astype(np.float64)
+    points, faces = points.numpy().astype(np.float64), faces.numpy().reshape(-1, 3).astype(np.int64)
     nearest = torch.searchsorted(codes, code(torch.from_numpy(np.rint(points)).int())).clamp_max(len(codes) - 1)
-    return Surface(voxel * points, faces.numpy().reshape(-1, 3).astype(np.int64), colors[nearest].numpy())
+    return Surface(voxel * (points + first.numpy()), faces, colors[nearest].numpy())

@@ -13,6 +13,7 @@ from warp_splat.errors import InputError
 SAME_ANGLE = 0.002  # rad
 SAME_PLACE = 0.002  # of the distance to what one looks at
 USUAL_WINDOW = (16, 9)
+MOST_PIXELS = 1 << 16  # along an edge
 VIEW_ANGLE = 0.9  # rad, vertical field of view where no camera says another
 
 Box = tuple[slice, slice]  # rows and columns of a window
@@ -38,10 +39,11 @@ def browser_camera(wxyz, position, fov: float, width: int, height: int) -> Camer
         height: of the window, px.
 
     Raises:
-        InputError: if that is no camera: a window without pixels, a value that is not finite.
+        InputError: if that is no camera: a window without pixels or too large, a value that is not finite.
     """
     wxyz, position = np.asarray(wxyz, np.float64), np.asarray(position, np.float64)
-    if not (0 < fov < np.pi and np.isfinite([*wxyz, *position]).all() and np.linalg.norm(wxyz) > 0):
+    shaped = wxyz.shape == (4,) and position.shape == (3,) and max(width, height) < MOST_PIXELS
+    if not (shaped and 0 < fov < np.pi and np.isfinite([*wxyz, *position]).all() and np.linalg.norm(wxyz) > 0):
         raise InputError(f"camera of the browser: expected a pose and an angle, got {wxyz}, {position} and {fov}.")
     rotation = Rotation.from_quat(np.roll(wxyz, -1)).as_matrix().T
     focal = 0.5 * height / np.tan(0.5 * fov)
