@@ -285,7 +285,7 @@ def test_no_file_but_a_page_is_written_over(tmp_path, fails):
     photo = tmp_path / "photo.jpg"
     photo.write_text("a photograph")
     assert "ends in .html" in fails("inspect", SCENE, "-o", photo) and photo.read_text() == "a photograph"
-    assert "photo.jpg is a file" in fails("inspect", SCENE, "-o", photo / "page.html")
+    assert "photo.jpg is no folder" in fails("inspect", SCENE, "-o", photo / "page.html")
 
 
 def test_text_of_the_scene_is_not_html(tmp_path, capsys):

@@ -16,7 +16,7 @@ from test_rasterize import GRADIENT, PLAIN, check_image, leaves_of, rasterize, r
 from torch.utils.checkpoint import checkpoint
 
 import warp_splat
-from warp_splat import InputError, RasterOptions
+from warp_splat import Camera, InputError, RasterOptions
 from warp_splat.config import ADJOINTS
 from warp_splat.raster.drivers import CPU, CUDA, DRIVERS
 from warp_splat.training.loss import image_loss
@@ -130,6 +130,19 @@ def test_zero_gaussians(device):
     assert out.means2d.shape == (0, 2) and out.radii.shape == (0,)
     _, gradients = run("empty", device)
     assert all(gradients[name].numel() == 0 for name in PARAMETERS)
+
+
+@pytest.mark.parametrize("options", [{"alpha_min": 0.0}, {"alpha_min": 1e-9}, {"tolerance": 1e-6}], ids=str)
+def test_where_alpha_rounds_to_zero_there_is_no_depth(options):
+    """Beside a Gaussian, in front of a camera of one row: its weight does not, and its gradient is not huge."""
+    camera, mean = Camera(32, 1, 30, 30, 2, 0.5, np.eye(3), np.zeros(3)), torch.tensor([[0.0, 0.0, 3.0]])
+    given = [torch.tensor([[1.0, 0, 0, 0]]), torch.full((1, 3), 0.2), torch.tensor([0.9]), torch.zeros(1, 1, 3)]
+    out = warp_splat.rasterize(mean.requires_grad_(), *given, camera, options=RasterOptions(depth=True, **options))
+    none = out.alpha == 0
+    assert none.any() and not out.depth[none].any()
+    assert (out.depth[~none] - 3).abs().max() < 1.5  # as far as the transmittance has digits
+    out.depth[none].sum().backward()
+    assert not mean.grad.any()
 
 
 def test_background_defaults_to_black_and_may_be_numbers(device):

@@ -21,6 +21,7 @@ from warp_splat.formats.ply import load_ply, save_ply_parts
 from warp_splat.formats.png import load_png
 from warp_splat.raster.drivers import CPU
 from warp_splat.training.loss import image_loss
+from warp_splat.training.optimizer import Optimizer
 
 
 def learns(folder):
@@ -197,7 +198,7 @@ def test_output_folder_that_cannot_be_written(tmp_path, fails):
     (tmp_path / "file").write_text("in the way")
     for scene in (SCENE, tmp_path / "no scene"):  # said before the scene is loaded
         message = fails("train", "-s", str(scene), "-m", str(tmp_path / "file" / "model"))
-        assert f"{tmp_path / 'file'} is a file" in message
+        assert f"{tmp_path / 'file'} is no folder" in message
 
 
 def test_render_without_a_model(tmp_path, fails):
@@ -295,6 +296,22 @@ def test_memory_that_runs_out_is_explained_once_the_model_is_saved(target, error
     assert len(load_ply(saved).splats.means) == 4500 and str(saved) in text.out
     assert where in text.err and "4500 Gaussians on" in text.err and "Traceback" not in text.err
     assert "--max_gaussians" in text.err and "-r" in text.err
+
+
+def test_memory_that_runs_out_while_the_set_grows_saves_no_torn_model(tmp_path, monkeypatch, capsys):
+    """Some of its tables would have other rows than others."""
+    put = Optimizer._put
+
+    def failing(optimizer, name, *tables):
+        if name == "quats":
+            raise torch.OutOfMemoryError("out of memory")
+        put(optimizer, name, *tables)
+
+    monkeypatch.setattr(Optimizer, "_put", failing)
+    assert train(tmp_path) == 1
+    text = capsys.readouterr()
+    assert "in stage 'densify'" in text.err and "To continue after iteration" in text.out
+    assert "Model after" not in text.out and not [*tmp_path.glob("point_cloud/*/*.ply")]
 
 
 @pytest.mark.parametrize(

@@ -46,7 +46,7 @@ def check_place(folder: Path) -> None:
     """
     place = next(path for path in (folder.absolute(), *folder.absolute().parents) if os.path.lexists(path))
     if not (place.is_dir() and os.access(place, os.W_OK | os.X_OK)):
-        reason = "may not be written" if place.is_dir() else "is a file"
+        reason = "may not be written" if place.is_dir() else "is no folder"
         raise InputError(f"{folder}: expected a folder that can be written ({place} {reason}); choose another.")
 
 

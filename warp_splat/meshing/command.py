@@ -68,8 +68,7 @@ def mesh(config: MeshConfig) -> int:
         raise InputError(f"{config.model}: {expected}; train on more photographs, or longer.")
     voxel, voxels = _grid(config, natural, views, memory / 2)
     surface = surface_in(voxels, views, voxel, config.watertight)
-    found = len(surface.faces)
-    if not found:
+    if not (found := len(surface.faces)):
         raise InputError(f"--voxel {voxel:g}: no surface goes through voxels of this size; try {natural:.2g}.")
     if 0 < config.triangles < found:
         surface = simplified(surface, config.triangles)

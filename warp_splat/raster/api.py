@@ -211,7 +211,7 @@ def render(
     return RenderOutput(
         image=image,
         alpha=alpha,
-        depth=depth / alpha.clamp_min(1e-10) if options.depth else None,
+        depth=torch.where(alpha > 0, depth / alpha.clamp_min(1e-10), 0.0) if options.depth else None,
         means2d=found.means2d,
         radii=found.radii if all_valid else found.radii.clamp_min(0),
         conics=found.conics,

@@ -75,7 +75,7 @@ def certify(
     Raises:
         InputError: if the background is negative, or no color.
     """
-    if background.dim() != 1 or float(background.min()) < 0.0:
+    if background.dim() != 1 or float(background.detach().min()) < 0.0:
         raise InputError("options.bound: expected a background of one color without negative numbers; give one.")
     with torch.no_grad():
         count, device, faint = len(splats.radii), background.device, min(options.alpha_min, FAINT)

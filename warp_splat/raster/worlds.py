@@ -104,7 +104,7 @@ class Worlds:
         (image, alpha, depth), blending.saved = self.driver.blend(self.bins, self.camera, black, self.options, False)
         found = {"image": image, "alpha": alpha}
         if self.options.depth:
-            found["depth"] = depth / alpha.clamp_min(1e-10)
+            found["depth"] = torch.where(alpha > 0, depth / alpha.clamp_min(1e-10), 0.0)
         if self.options.strongest:  # that takes numbers and weights from the lists, nothing from the splats
             found["strongest"], found["strongest_weights"], _ = find_strongest(self.splats, blending)
         shape = len(self.counts), self.bins.height

@@ -130,7 +130,7 @@ def render_model(config: RenderConfig) -> int:
                 extra = {"split": "test", "gaussians": len(model)}
                 where = None
                 if scene is not given:
-                    where = where_taken(model.activated(), finished.background(device), options, scene.extent)
+                    where = where_taken(model.activated(), finished.background(device), options, given.extent)
                 means, compared = evaluate_views(picture, scene.test, folder, "test", iteration, extra, metrics, where)
                 show_views(compared, folder, "test", iteration, say)
                 print(f"  test   {len(scene.test)} views in {folder / 'test' / f'ours_{iteration}'}")

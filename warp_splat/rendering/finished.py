@@ -106,8 +106,7 @@ class Finished:
             InputError: as :func:`warp_splat.load_scene`, or if it is not known which scene that is.
         """
         trained, trained_on = self.trained, str(self.trained.get("source_path", ""))
-        source = source_path or trained_on
-        if not source:
+        if not (source := source_path or trained_on):
             raise InputError(f"{self.path}: it does not say what it was trained on; name the scene with -s.")
         if trained_on and os.path.abspath(source) != os.path.abspath(trained_on):
             say(f"The scene is {source}; the model was trained on {trained_on}.")
