@@ -64,15 +64,20 @@ def test_a_ball():
     np.testing.assert_allclose(found.colors, np.float32([[0.2, 0.5, 0.8]]).repeat(len(found.colors), 0), atol=1e-5)
 
 
-def test_a_ball_far_from_the_origin():
-    """More than 2^20 voxels: float32 has no more digits than these, and its surface no folds."""
-    far = np.array([0.0, 1_300_000 * VOXEL, 0.0])
-    views = [ball(index) for index in range(VIEWS)]
-    moved = [replace(view.camera, translation=view.camera.translation - view.camera.rotation @ far) for view in views]
-    found = surface([view._replace(camera=camera) for view, camera in zip(views, moved, strict=True)])
-    assert np.abs(np.linalg.norm(found.vertices - far, axis=1) - 1).max() < VOXEL
-    mesh = trimesh.Trimesh(found.vertices, found.faces, process=False)
-    assert mesh.is_winding_consistent and mesh.volume == pytest.approx(4 / 3 * np.pi, rel=0.03)
+@pytest.mark.parametrize("places", [[1_300_000], [-900_000, 900_000]])
+def test_balls_far_from_the_origin(places):
+    """About 2^20 voxels: float32 has no more digits than these, and their surface no folds."""
+    views = []
+    for far in (np.array([0.0, place * VOXEL, 0.0]) for place in places):
+        for view in (ball(index) for index in range(VIEWS)):
+            turned = view.camera.translation - view.camera.rotation @ far
+            views.append(view._replace(camera=replace(view.camera, translation=turned)))
+    found = surface(views)
+    middles = np.array(places)[(np.abs(found.vertices[:, 1, None] - VOXEL * np.array(places))).argmin(1)] * VOXEL
+    rays = found.vertices - np.stack([0 * middles, middles, 0 * middles], 1)
+    assert np.abs(np.linalg.norm(rays, axis=1) - 1).max() < VOXEL
+    mesh = trimesh.Trimesh(rays, found.faces, process=False)
+    assert mesh.is_winding_consistent and mesh.volume == pytest.approx(4 / 3 * np.pi * len(places), rel=0.03)
 
 
 def test_a_disc_is_where_rays_meet_its_plane():

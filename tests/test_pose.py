@@ -186,7 +186,7 @@ def test_render_knows_the_cameras(trained, capsys, file):
     assert trained_results["PSNR_POSE"] >= trained_results["PSNR"]
     assert "PSNR_POSE" in (trained / "per_view.md").read_text()
     assert main(["render", "-m", str(trained / file), "--skip_train"]) == 0
-    assert "cameras are those of the model, which were refined" in capsys.readouterr().out
+    assert "cameras are those of the model, which were refined with it" in capsys.readouterr().out
     results = json.loads((folder / "results.json").read_text())[name]
     for name in ("PSNR", "SSIM"):
         assert results[name] == pytest.approx(trained_results[name], abs=1e-3), name

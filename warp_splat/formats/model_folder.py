@@ -154,7 +154,8 @@ def open_model(
     path = Path(path)
     iteration = 0 if is_file_of_gaussians(path) else find_iteration(path, iteration)
     found = load_gaussians(gaussians_file(path, iteration), report)
-    args = (path.absolute().parents[2] if path.absolute().match(AS_SAVED) else path) / "cfg_args"
+    place = Path(os.path.abspath(path))
+    args = (place.parents[2] if place.match(AS_SAVED) else path) / "cfg_args"
     options = read_cfg_args(args.parent) if args.exists() else {"eval": True}
     if options.get("projection", PROJECTIONS[0]) not in PROJECTIONS:
         raise InputError(f"{args}: expected a projection of {', '.join(PROJECTIONS)}, found another; correct it there.")
@@ -257,7 +258,7 @@ def read_refined(path: str | Path, iteration: int) -> dict[str, Camera]:
     Raises:
         InputError: if the file is damaged.
     """
-    place = gaussians_file(path, iteration).absolute()
+    place = Path(os.path.abspath(gaussians_file(path, iteration)))
     return dict(read_cameras(place.parent)) if place.match(AS_SAVED) else {}
 
 

@@ -25,7 +25,7 @@ TRUNCATION = 3.0  # voxels
 AGREEING = 0.2  # share of the views asked that see a place where a pixel sees it, or its depth does not count
 TOLERANCE = 0.01  # of the depth, within which that is the same place
 OTHERS = 40  # views that are asked, those that are nearest
-HALF = 1 << 20  # places on the grid lie between -HALF and HALF
+HALF = 1 << 20  # blocks, and voxels from the middle, lie between -HALF and HALF
 
 
 class Drawn(NamedTuple):
@@ -173,8 +173,8 @@ def surface_of(voxels: torch.Tensor, views: Sequence[Drawn], voxel: float, water
     if watertight and (distances.abs() < 1).any():
         voxels, distances, colors = closed(voxels, distances, colors)
     known = (~torch.isnan(distances)).nonzero()[:, 0]
-    first = voxels[:1]  # from there, codes differ and float32 is exact, wherever the scene is
-    voxels = voxels - first
+    middle = (voxels.amin(0, True) + voxels.amax(0, True)) // 2 if len(voxels) else voxels
+    voxels = voxels - middle  # so that codes differ and float32 is exact, wherever the scene is
     codes, order = torch.sort(code(voxels[known]))
     voxels, distances, colors = (values[known[order]] for values in (voxels, distances, colors))
     corners = []
@@ -188,4 +188,4 @@ def surface_of(voxels: torch.Tensor, views: Sequence[Drawn], voxel: float, water
     points, faces = sparse_marching_cubes_from_cells(places, values, device="cpu")
     points, faces = points.numpy().astype(np.float64), faces.numpy().reshape(-1, 3).astype(np.int64)
     nearest = torch.searchsorted(codes, code(torch.from_numpy(np.rint(points)).int())).clamp_max(len(codes) - 1)
-    return Surface(voxel * (points + first.numpy()), faces, colors[nearest].numpy())
+    return Surface(voxel * (points + middle.numpy()), faces, colors[nearest].numpy())

@@ -105,7 +105,7 @@ def render_model(config: RenderConfig) -> int:
         given = finished.load_scene(config.source_path, say)
         scene = finished.refined(given)
         if scene is not given:
-            say(f"The cameras are those of the model, which were refined in iteration {iteration}.")
+            say("The cameras are those of the model, which were refined with it.")
     options = replace(finished.options, of=config.of, tolerance=config.tolerance or None)
     say(f"{len(model)} Gaussians from {config.model_path}, iteration {iteration}")
     with _memory_explained(device, model, None if config.orbit else scene):

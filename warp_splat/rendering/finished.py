@@ -36,7 +36,7 @@ class Finished:
     Attributes:
         iteration: that was found; of a file, 0.
         file: the Gaussians.
-        trained: options of the training; of a file, that every 8th view was held out.
+        trained: options of the training; of a file alone, that every 8th view was held out.
         harmonics: what lies behind the Gaussians, [16, 3], or None.
         exposures: of the photographs, or None.
 
@@ -112,7 +112,7 @@ class Finished:
             say(f"The scene is {source}; the model was trained on {trained_on}.")
         resolution = trained.get("resolution", -1)
         if not isinstance(resolution, int):
-            raise InputError(f"{self.path}/cfg_args: expected a whole number as resolution, found {resolution!r}.")
+            raise InputError(f"{self.path}: expected a whole number as resolution in cfg_args, found {resolution!r}.")
         flags = {name: bool(trained.get(name)) for name in ("white_background", "eval", "invert_masks")}
         names = {"images": str(trained.get("images", "images")), "lens": str(trained.get("lens", "undistort"))}
         names["block"] = str(trained.get("block", ""))

@@ -152,7 +152,7 @@ def _run(trainer: Trainer, run: Run, viewer: TrainingViewer | None) -> int:
             tqdm.write(f"warp-splat: error: {error}", file=sys.stderr)
             return 1
         finally:  # whatever happened, the model comes first
-            if whole and not trainer.torn:
+            if whole and not trainer.optimizer.torn:
                 run.saved = trainer.lead(lambda: save_model(trainer, run))
             if run.saved:
                 print(f"Model after {run.iteration} iterations: {run.saved}")

@@ -96,6 +96,7 @@ class Optimizer:
         folder: Path | None = None,
     ):
         self.folder = folder
+        self.torn = False  # whether some tables have other rows than others, since memory or disk ran out
         self.model, self.options, self.extent, self.scale = model, options, extent, math.sqrt(batch)
         self.batch, self.parts = batch, {group["name"]: group["params"][0] for group in parts}
         for name, leaf in self.parts.items():
@@ -212,6 +213,7 @@ class Optimizer:
             values, *moments = (self._taken(old, kept, len(rows)) for old in (table.leaf.detach(), *table.moments))
             values[len(kept) :] = rows
             self._put(name, values, moments)
+            self.torn = name != self.model.NAMES[-1]
 
     def arrange(self, moved: Callable[[torch.Tensor], torch.Tensor]) -> None:
         """Put the rows, moments and all, into the order that ``moved`` gives them."""
@@ -221,6 +223,7 @@ class Optimizer:
         for name in self.model.NAMES:
             table = self.tables[name]
             self._put(name, moved(table.leaf.detach()), [moved(moment) for moment in table.moments])
+            self.torn = name != self.model.NAMES[-1]
 
     def reset_opacities(self, ceiling: float) -> None:
         """Lower every opacity to at most ``ceiling`` and forget its moments."""

@@ -102,7 +102,6 @@ class Trainer:
         self.deck = Deck(scene.train, seed)
         self.photographs = Photographs(config, scene, self.device, any(having(self.parts, "reads_alpha")))
         self.room = Room()  # for tile instances
-        self.torn = False  # whether some tables of the Gaussians have other rows than others: memory or disk ran out
         self._radii = self.model.parameters["means"].new_zeros(len(self.model), dtype=torch.int32)  # in the last step
 
     def _folder(self) -> Path:
@@ -189,9 +188,7 @@ class Trainer:
     def update(self, iteration: int) -> None:
         """Densify or take a step of Adam. A set that changed has no gradients yet, and no step, as in the reference."""
         with stage("densify"):
-            self.torn = True
             changed = self.growth.update(iteration) if self.config.learn.grows_at(iteration) else None
-            self.torn = False
         if changed is not None:
             self.check_identical(iteration)
             self.dropped["prunings"] += changed.refused

@@ -13,7 +13,7 @@ from warp_splat.errors import InputError
 SAME_ANGLE = 0.002  # rad
 SAME_PLACE = 0.002  # of the distance to what one looks at
 USUAL_WINDOW = (16, 9)
-MOST_PIXELS = 1 << 16  # along an edge
+MOST_PIXELS = 1 << 20  # along an edge
 VIEW_ANGLE = 0.9  # rad, vertical field of view where no camera says another
 
 Box = tuple[slice, slice]  # rows and columns of a window
@@ -44,7 +44,7 @@ def browser_camera(wxyz, position, fov: float, width: int, height: int) -> Camer
     wxyz, position = np.asarray(wxyz, np.float64), np.asarray(position, np.float64)
     shaped = wxyz.shape == (4,) and position.shape == (3,) and max(width, height) < MOST_PIXELS
     if not (shaped and 0 < fov < np.pi and np.isfinite([*wxyz, *position]).all() and np.linalg.norm(wxyz) > 0):
-        raise InputError(f"camera of the browser: expected a pose and an angle, got {wxyz}, {position} and {fov}.")
+        raise InputError(f"browser: expected a pose, angle and window, got {wxyz}, {position}, {fov}, {width, height}.")
     rotation = Rotation.from_quat(np.roll(wxyz, -1)).as_matrix().T
     focal = 0.5 * height / np.tan(0.5 * fov)
     return Camera(width, height, focal, focal, 0.5 * width, 0.5 * height, rotation, -rotation @ position)
