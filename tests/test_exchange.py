@@ -1,9 +1,11 @@
 """Formats of Gaussians: bytes against what their documents say, axes, round trips, what is lost, and renders."""
 
+import copy
 import errno
 import struct
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -34,6 +36,7 @@ from warp_splat.formats.model_folder import ply_path
 from warp_splat.formats.splats import SplatFile, frame, turned
 from warp_splat.gaussians import GaussianModel
 from warp_splat.rendering.changes import losses
+from warp_splat.rendering.finished import Finished
 
 NAME = "KHR_gaussian_splatting"
 MIRRORS = {"RUB": [1, -1, -1], "LUF": [-1, -1, 1]}  # of our axes, which are right, down, forward
@@ -187,6 +190,18 @@ def test_gltf_pieces_are_joined(tmp_path):
     before = place(tmp_path, [{"mesh": 0}, {"mesh": 0, "translation": [5, 0, 0]}], scenes=[{"nodes": [0, 1]}])
     after = load_gaussians(tmp_path / "b.glb", report=silent).splats
     np.testing.assert_array_equal(after.means, np.concatenate([before.means, before.means - [5, 0, 0]]).astype("f4"))
+
+
+def test_gltf_pieces_of_both_lights_are_refused(tmp_path):
+    place(tmp_path, [{"mesh": 0}])
+    document, binary = glb_parts(tmp_path / "a.glb")
+    first, second = copy.deepcopy(document["meshes"]), copy.deepcopy(document["meshes"])
+    whole = {**document, "nodes": [{"mesh": 0}, {"mesh": 1}], "scenes": [{"nodes": [0, 1]}], "meshes": first + second}
+    second[0]["primitives"][0]["extensions"][NAME]["colorSpace"] = "lin_rec709_display"
+    (tmp_path / "b.glb").write_bytes(glb_bytes(whole, binary))
+    refusal(lambda: load_gaussians(tmp_path / "b.glb"), "some are in linear light and some are not")
+    (tmp_path / "b.glb").write_bytes(glb_bytes({**whole, "meshes": 2 * second}, binary))
+    assert Finished(tmp_path / "b.glb").is_linear(SimpleNamespace(linear=False))
 
 
 def test_gltf_quantized_attributes(tmp_path):
@@ -383,16 +398,3 @@ def test_convert_bounds_what_pictures_lose(tmp_path, capsys, ending):
     assert main(["convert", str(tmp_path / "a.ply"), str(tmp_path / f"b{ending}"), "--bound"]) == 0
     measured, bound = changes_told(capsys.readouterr().out)
     assert 0.0 < measured <= bound
-
-
-@pytest.mark.parametrize(
-    ("options", "sentence"),
-    [
-        ("--orbit --bound", "--bound: expected views"),
-        ("--video path --orbit_center origin", "--orbit_center origin: expected --orbit or --video orbit"),
-        ("--device cpu", "name the scene with -s"),
-    ],
-)
-def test_what_render_makes_of_a_file_alone(tmp_path, fails, options, sentence):
-    save_gaussians(tmp_path / "a.spz", some_file(100))
-    assert sentence in fails("render", "-m", tmp_path / "a.spz", *options.split())

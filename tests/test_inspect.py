@@ -98,6 +98,16 @@ def test_the_reprojection_error_is_that_of_pycolmap(capsys):
     assert np.isclose(errors.mean(), expected, rtol=1e-6)
 
 
+def test_points_at_infinity_hide_no_errors():
+    subject, _ = read_subject(SCENE, "images")
+    list(geometry.check_reprojection(subject))
+    whole, few = dict(subject.errors), list(subject.model.points3D)[:5]
+    for number in few:
+        subject.model.point3D(number).xyz = np.full(3, np.inf)
+    list(geometry.check_reprojection(subject))
+    assert all(np.isfinite(errors).all() and len(errors) > 0.9 * len(whole[n]) for n, errors in subject.errors.items())
+
+
 ASIDE = np.array((0.3, 0.0, 0.0))
 FLIP = pycolmap.Rigid3d(pycolmap.Rotation3d(np.diag((1.0, -1.0, -1.0))), np.zeros(3))
 

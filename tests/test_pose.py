@@ -12,6 +12,7 @@ from scene_files import write_colmap
 from scipy.spatial.transform import Rotation
 from trainings import begin, state_of, stepped
 
+from warp_splat.camera import Camera
 from warp_splat.cli import main
 from warp_splat.evaluation import alignment
 from warp_splat.evaluation.alignment import find_pose
@@ -103,6 +104,15 @@ def test_only_what_is_seen_learns_and_the_set_stays(scene, tmp_path):
     trainer, _ = begin(scene, tmp_path, parts="pose")
     assert trainer.refined([given])[0].camera.fx == given.camera.fx
     assert held.original.fx / given.original.fx == pytest.approx(held.camera.fx / given.camera.fx)
+
+
+def test_the_size_of_a_panorama_says_its_intrinsics(scene, tmp_path):
+    trainer, _ = begin(scene, tmp_path, **ALL)
+    trainer.parts[0].stretches.detach().fill_(0.1)
+    view, turn = scene.train[0], 64 / (2 * np.pi)
+    around = Camera(64, 32, turn, turn, 32, 16, np.eye(3), np.zeros(3), Lens("EQUIRECTANGULAR", ()))
+    assert trainer.parts[0].refined(around, view).fx == turn
+    assert trainer.parts[0].refined(view.camera, view).fx == pytest.approx(1.1 * view.camera.fx)
 
 
 def test_verdict(tmp_path):

@@ -105,14 +105,14 @@ def test_exr_needs_no_parameters_and_masks_count(mapped):
     scene, folder = mapped
     scene = replace(scene, train=scene.train[:2])
     numbers = np.linspace(0, 2, 31 * 33, dtype=np.float32).reshape(31, 33)
-    numbers[2] = np.nan
+    numbers[2], numbers[3] = np.nan, -1
     for view in scene.train:
         write_floats((folder / "exr" / view.name).with_suffix(".exr"), numbers[..., None], "float")
     (folder / PARAMETERS).unlink()
     mask = np.ones((31, 33), np.uint8)
     mask[5] = 0
     masked = replace(scene, train=[replace(view, photograph=view.pixels._replace(mask=mask)) for view in scene.train])
-    for given, unknown in ((scene, [2]), (masked, [2, 5])):
+    for given, unknown in ((scene, [2, 3]), (masked, [2, 3, 5])):
         expected = numbers.copy()
         expected[unknown] = -1
         assert np.array_equal(read_inverse_depths(given, str(folder / "exr"))[given.train[1]], expected)

@@ -215,6 +215,8 @@ def test_simplify_to_a_size_and_to_a_loss(folder, tmp_path, capsys):
     arguments = ["simplify", str(folder), "--device", "cpu"]
     assert main([*arguments, "--size", f"{size / 1000}kB", "-o", str(tmp_path / "a.spz")]) == 0
     assert 0.9 * size < (tmp_path / "a.spz").stat().st_size <= size
+    assert main([*arguments, "--size", f"{size / 1000}kB", "--steps", "6", "-o", str(tmp_path / "a.spz")]) == 0
+    assert 0.9 * size < (tmp_path / "a.spz").stat().st_size <= size
     capsys.readouterr()
     assert main([*arguments, "--max_loss", "0.5", "-o", str(tmp_path / "b.ply")]) == 0
     said = capsys.readouterr().out

@@ -50,8 +50,7 @@ def format_of(path: str | Path) -> Format:
     Raises:
         InputError: if its ending is not one of FORMATS.
     """
-    endings = [ending for ending in FORMATS if Path(path).name.lower().endswith(ending)]
-    if not endings:
+    if not (endings := [ending for ending in FORMATS if Path(path).name.lower().endswith(ending)]):
         found = Path(path).suffix or "no ending"
         raise InputError(f"{path}: expected a name that ends in {', '.join(FORMATS)}, found {found!r}.")
     return FORMATS[max(endings, key=len)]

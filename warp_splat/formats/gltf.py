@@ -96,12 +96,14 @@ def load_gltf(path: str | Path, report: Report = print) -> SplatFile:
                 raise Unexpected("more Gaussians than its data has room for, some placed many times")
             turn, translation, scale = decompose(world)
             parts.append(turned(splats, frame(AXES) @ turn, frame(AXES) @ translation, scale))
+        told = [piece["extensions"][NAME] for piece, _ in placed]
+        linear = {extension.get("colorSpace") == COLOR_SPACES[1] for extension in told}
+        if len(linear) > 1:
+            raise Unexpected("meshes of which some are in linear light and some are not; export them alike")
     for note in dict.fromkeys(notes):
         report(f"{path}: {note}.")
-    told = [piece["extensions"][NAME] for piece, _ in placed]
     antialiased = all(_extra(extension, RENDER_MODE) == "mip" for extension in told)
-    linear = all(extension.get("colorSpace") == COLOR_SPACES[1] for extension in told)
-    return SplatFile(concatenated(parts), antialiased, kept(_extra(document.json, COORDINATES)), linear)
+    return SplatFile(concatenated(parts), antialiased, kept(_extra(document.json, COORDINATES)), linear.pop())
 
 
 def _attributes(splats: SplatArrays, in_linear: bool, report: Report) -> dict[str, np.ndarray]:

@@ -35,15 +35,15 @@ def sample(items: Any, count: int) -> Any:
 
 def check_reprojection(subject: Subject) -> Iterator[Finding]:
     """Points projected into images, against the keypoints from which they were triangulated."""
-    if subject.model is None:
+    if (model := subject.model) is None:
         return
     names = {photo.name for photo in subject.photos}
-    registered = [subject.model.image(i) for i in sorted(subject.model.reg_image_ids())]
+    registered = [model.image(i) for i in sorted(model.reg_image_ids())]
     chosen = sample([image for image in registered if image.name in names], VIEWS)
     widths = {}
     for image in chosen:
-        seen = [point for point in image.get_observation_points2D() if subject.model.exists_point3D(point.point3D_id)]
-        pairs = [(point.xy, subject.model.point3D(point.point3D_id).xyz) for point in seen]
+        seen = [point for point in image.get_observation_points2D() if model.exists_point3D(point.point3D_id)]
+        pairs = [(point.xy, xyz) for point in seen if np.isfinite(xyz := model.point3D(point.point3D_id).xyz).all()]
         if not pairs:
             continue
         keypoints, xyz = (np.array(column, np.float64) for column in zip(*pairs, strict=True))

@@ -50,8 +50,7 @@ def write_page(
 
 def draw_pictures(subject: Subject) -> Iterable[tuple[str, str]]:
     """Captions and pictures, as addresses of data that a page holds itself."""
-    shown = [photo for photo in subject.photos if photo.name in subject.thumbnails]
-    if not shown:
+    if not (shown := [photo for photo in subject.photos if photo.name in subject.thumbnails]):
         return
     yield "The photographs, evenly chosen", _encode(_sheet(subject, [photo.name for photo in sample(shown, SHEET)]))
     if not len(subject.points):

@@ -64,6 +64,11 @@ def simplify(config: SimplifyConfig) -> int:
     splats = made(count)
     if not config.tolerance:
         splats = fewer_harmonics(splats, opened.setting, squared_error(opened, splats))
+    if config.size and config.steps:  # trained numbers are harder to pack
+        thinning, total = Thinning(splats, opened.setting), len(splats.means)
+        splats = thinning.to(
+            _count(config, total, lambda n: written_bytes(output, file._replace(splats=thinning.to(n))))
+        )
     write(output, opened, splats)
     if config.tolerance:
         measured, bound = changed(splats)

@@ -72,8 +72,8 @@ class Finished:
         return [f"{what}, which no format has" for what, owes in owed.items() if owes]
 
     def is_linear(self, scene: Scene | None) -> bool:
-        """Whether its colors are in linear light: those of its scene, or else what its training says."""
-        return scene.linear if scene else bool(self.trained.get("linear_light"))
+        """Whether its colors are in linear light: as its scene's are, or as its training or its file says."""
+        return bool(self.trained.get("linear_light")) or (scene is not None and scene.linear)
 
     def background(self, device: torch.device) -> torch.Tensor:
         """What lies behind the Gaussians: a color [3]; or the harmonics [16, 3] in its place, if there are any."""
@@ -124,8 +124,7 @@ class Finished:
         Raises:
             InputError: if the scene has changed since the training.
         """
-        cameras = read_refined(self.path, self.iteration)
-        if not cameras:
+        if not (cameras := read_refined(self.path, self.iteration)):
             return scene
         train, test = ([self._refined(view, cameras) for view in views] for views in (scene.train, scene.test))
         return replace(scene, train=train, test=test)

@@ -205,8 +205,7 @@ def with_masks(photos: list[Photo], source: Path, report: Report) -> list[Photo]
 
 def _hold_out(photos: list[Photo], source: str | Path) -> tuple[list[Photo], list[Photo]]:
     photos = sorted(photos, key=lambda photo: photo.name)
-    train = [photo for index, photo in enumerate(photos) if index % HOLD_OUT]
-    if not train:
+    if not (train := [photo for index, photo in enumerate(photos) if index % HOLD_OUT]):
         raise InputError(
             f"{source}: expected at least 2 images when a test set is held out, found {len(photos)}, which leaves "
             "none to train on; add images or leave out --eval."

@@ -44,8 +44,7 @@ def read_colmap(
         InputError: if the model cannot be read, lacks images, or disagrees with the image files.
     """
     where, model = _largest_model(source / "sparse", report)
-    registered = registered_images(model)
-    if not registered:
+    if not (registered := registered_images(model)):
         raise InputError(f"{where}: expected a COLMAP model with registered images, found none; run its mapper again.")
     points, colors = _points(model, report)
     return _photos(where, registered, source / folder, report, make_sampling(native)), points, colors
@@ -60,8 +59,7 @@ def read_tracks(source: Path) -> dict[str, Sightings]:
     _, model = _largest_model(source / "sparse", lambda line: None)
     places, tracks = {i: point.xyz for i, point in model.points3D.items()}, {}
     for image in (model.image(i) for i in model.reg_image_ids()):
-        seen = [point for point in image.get_observation_points2D() if point.point3D_id in places]
-        if not seen:
+        if not (seen := [point for point in image.get_observation_points2D() if point.point3D_id in places]):
             continue
         ids = np.array([point.point3D_id for point in seen], np.int64)
         slopes = np.array(image.camera.cam_from_img(np.array([point.xy for point in seen], np.float64)))

@@ -58,8 +58,7 @@ def _find(folder: Path, view: View) -> Path:
             "as it is read; use --lens native, or undistort photographs and maps first."
         )
     paths = [folder / Path(view.name).with_suffix(ending) for ending in ENDINGS]
-    found = [path for path in paths if path.is_file()]
-    if not found:
+    if not (found := [path for path in paths if path.is_file()]):
         raise InputError(f"{paths[0]}: expected a map of inverse depth for {view.name}, found none; add it.")
     return found[0]
 
@@ -98,7 +97,8 @@ def _read(path: Path, view: View, fit: Fit) -> np.ndarray:
             f"got {numbers.shape[1]} x {numbers.shape[0]}; make it from the photograph."
         )
     rows, columns = nearest_of(height, numbers.shape[0]), nearest_of(width, numbers.shape[1])
-    found = np.maximum(numbers[rows[:, None], columns], 0.0) * fit.scale + fit.offset
+    picked = numbers[rows[:, None], columns]
+    found = np.where(picked < 0.0, np.nan, picked) * fit.scale + fit.offset
     known = np.isfinite(found) & (found >= 0.0) & (True if (mask := view.mask) is None else mask > 0)
     return np.where(known, found, -1.0).astype(np.float32)
 

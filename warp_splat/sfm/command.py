@@ -117,8 +117,7 @@ def _claim(source: Path, scene: Path, config: SfmConfig) -> Path:
                 f"{scene}: expected a folder for the scene that does not hold the photographs, since its images/ would "
                 f"be written over; choose another, such as {scene_of(scene)}."
             )
-        files = [(name, photo_root(source) / name) for name in find_files(photo_root(source), PHOTOS, scene)]
-        if not files:
+        if not (files := [(name, photo_root(source) / name) for name in find_files(photo_root(source), PHOTOS, scene)]):
             raise _nothing_found(source)
     else:
         files = [(source.name, source)]
@@ -189,8 +188,7 @@ def _reconstruct(root: Path, names: list[str], scene: Path, work: Path, config: 
         )
     model, path = models[0], work / "placed"
     registered = {model.image(index).name for index in model.reg_image_ids()}
-    where = georeference(model, database, config.coordinates, config.seed, say)
-    if not where:
+    if not (where := georeference(model, database, config.coordinates, config.seed, say)):
         scale_as_usual(model)
     path.mkdir(exist_ok=True)
     model.write(path)

@@ -28,8 +28,7 @@ class Row(NamedTuple):
     @property
     def verdict(self) -> str:
         """Whether every statement held; if not in every mode, in which."""
-        failed = [mode for mode, outcome in self.outcomes.items() if outcome.failures]
-        if not failed:
+        if not (failed := [mode for mode, outcome in self.outcomes.items() if outcome.failures]):
             return "pass"
         return "FAIL" if len(failed) == len(self.outcomes) else f"FAIL {', '.join(failed)}"
 

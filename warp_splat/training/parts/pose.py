@@ -85,8 +85,7 @@ class Pose:
         if any(view.camera.lens and view.camera.lens.family.wide for view in scene.train):
             return Verdict(False, "poses of cameras that see beside themselves are not judged")
         pairs = [(view.camera, scene.tracks[view.name]) for view in scene.train if view.name in scene.tracks]
-        found = [pose_error(camera, seen) for camera, seen in pairs if len(seen.ids) >= ENOUGH]
-        if not found:
+        if not (found := [pose_error(camera, seen) for camera, seen in pairs if len(seen.ids) >= ENOUGH]):
             return Verdict(False, "the scene keeps no keypoints of its points, by which poses could be judged")
         off = float(np.median(found))
         return Verdict(off > OFF, f"the median pose is off by {off:.2f} px, judged by its points (limit {OFF} px)")
@@ -129,7 +128,8 @@ class Pose:
         free = self.options.pose_intrinsics == "all"
         units = [camera.fx, camera.fy, free * camera.width, free * camera.height]
         lens, units = torch.tensor([[camera.fx, camera.fy, camera.cx, camera.cy], units], dtype=torch.float64)
-        if self.options.pose_intrinsics and intrinsics_of(view) in self.lenses:
+        around = camera.lens is not None and camera.lens.family.around  # a panorama: its size says its intrinsics
+        if self.options.pose_intrinsics and not around and intrinsics_of(view) in self.lenses:
             stretch = stretches[self.lenses[intrinsics_of(view)]].double()
             lens = send(lens, stretch.device) + send(units, stretch.device) * stretch
         return CameraParameters(camera, twist, lens)
