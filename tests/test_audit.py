@@ -207,8 +207,9 @@ def test_a_program_is_audited_and_its_finding_made_small(tmp_path):
 
 @pytest.mark.slow
 def test_a_module_of_the_folder_where_one_stands_is_audited(tmp_path):
-    """By the installed command, and by the process that draws."""
-    (tmp_path / "mine.py").write_text("def draw(*given):\n    return given[-1].expand(48, 64, 3)\n")
+    """By the installed command, and by the process that draws, whose defaults are its own."""
+    defaults = "import torch\ntorch.set_default_dtype(torch.float64)\ntorch.set_grad_enabled(False)\n"
+    (tmp_path / "mine.py").write_text(defaults + "def draw(*given):\n    return given[-1].expand(48, 64, 3)\n")
     command = [Path(sys.executable).parent / "warp-splat", "audit", "mine:draw", "--case", "one"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.stdout.startswith("one: 1 Gaussian on ") and "off by 0.719" in done.stdout, done.stderr
@@ -253,10 +254,12 @@ def test_a_program_may_write_an_exr(tmp_path):
         (["audit_targets.own:manual", "--case", "one", "--degree", "9"], "--degree: expected 0 to 3, got 9"),
         (["audit_targets.own:manual", "-o", __file__], "expected a folder that can be written"),
         (["exits:draw"], "that can be imported, found SystemExit(3)"),
+        (["ends:draw"], "its process ended with 0"),
     ],
 )
 def test_bad_input_is_one_sentence(arguments, says, capsys, tmp_path, monkeypatch):
     (tmp_path / "exits.py").write_text("raise SystemExit(3)")
+    (tmp_path / "ends.py").write_text("import os; os._exit(0)")
     monkeypatch.syspath_prepend(tmp_path)
     assert main(["audit", *arguments]) == 1
     assert says in capsys.readouterr().err

@@ -225,7 +225,9 @@ def test_open_model(tmp_path, mark, monkeypatch, fails, capsys):
     said = capsys.readouterr().out
     for lost in ("in the world", "in linear light", "projection (ellipsoid)", "white background"):
         assert lost in said
-    assert main(["convert", str(folder), str(tmp_path / "a.glb")]) == 0
+    for source in (model_folder.ply_path(folder, 20), folder):
+        assert main(["convert", str(source), str(tmp_path / "a.glb")]) == 0
+        assert load_gaussians(tmp_path / "a.glb").coordinates["origin"] == [1.0, 2.0, 3.0]
     drawn = model_folder.open_model(tmp_path / "a.glb")
     assert load_start(str(folder), print)[0].linear  # so that training can warn
     (folder / "coordinates.json").write_text("{")
@@ -235,7 +237,7 @@ def test_open_model(tmp_path, mark, monkeypatch, fails, capsys):
     assert "not by the unscented one" in capsys.readouterr().out
     model_folder.write_cfg_args(folder, {"projection": "fisheye"})
     message = fails("render", "-m", folder)
-    assert "cfg_args: expected a projection of affine, ellipsoid, unscented, found another" in message
+    assert "cfg_args: expected a projection of affine, ellipsoid, unscented, found 'fisheye'" in message
     assert drawn[1].linear and drawn[1].coordinates["origin"] == [1.0, 2.0, 3.0] and drawn[2]["linear_light"]
 
 

@@ -167,6 +167,10 @@ def in_fits(change):
             lambda folder: (folder / PARAMETERS).unlink(),
             "depth_params.json: expected scale and offset of each map of inverse depth, found no such file",
         ),
+        (
+            in_fits(lambda fits: [fit.update(scale=-1.0) for fit in fits.values()]),
+            "--depths depths: expected maps of 1 / depth, found scales or numbers below 0; fit them.",
+        ),
         (in_fits(lambda fits: fits.pop("view_009")), "depth_params.json: expected JSON of the kind"),
         (
             in_fits(lambda fits: fits.update(view_009={"scale": None, "offset": 0})),

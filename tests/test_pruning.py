@@ -197,7 +197,18 @@ def test_simplify_to_a_share_with_training(folder, tmp_path, capsys, monkeypatch
     folder, splats = folder
     count = len(splats.means)
     output = tmp_path / "small.sog"
-    arguments = ["simplify", str(folder), "--keep", "0.5", "--steps", "6", "-o", str(output), "--device", "cpu"]
+    arguments = [
+        "simplify",
+        str(ply_path(folder, 7)),
+        "--keep",
+        "0.5",
+        "--steps",
+        "6",
+        "-o",
+        str(output),
+        "--device",
+        "cpu",
+    ]
     assert main(arguments) == 0
     out = capsys.readouterr().out
     assert f"{output}: {round(count / 2)} of {count} Gaussians" in out and "test PSNR" in out and "harmonics: " in out

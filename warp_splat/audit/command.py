@@ -37,11 +37,16 @@ def audit(config: AuditConfig) -> int:
     """
     sys.path.append("")  # modules of the folder where one stands, which an installed command does not see otherwise
     place = config.program or config.target
-    draw_by_program(place) if config.program else function_of(place)
+    if config.program or place.endswith(".html"):
+        draw_by_program(place) if config.program else function_of(place)
     if config.case and config.case not in SCENES:
         raise InputError(f"--case {config.case}: expected one of {', '.join(SCENES)}.")
-    out = prepare_folder(config.out)
     with closing(Renderer(place, config.limit)) as renderer:
+        try:  # in a process of its own, as modules of others change defaults, hang, or exit
+            renderer.start()
+        except RendererFailed as error:
+            raise InputError(f"{place}: expected what can be started, but it {error}.") from error
+        out = prepare_folder(config.out)
         if config.case:
             return _write_case(renderer, config.degree, config.case, out)
         facts, rows = run_audit(renderer, config.target, config.degree)

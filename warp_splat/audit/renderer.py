@@ -45,12 +45,8 @@ class Renderer:
         self.place, self.limit = place, limit
         self.process: Any = None
 
-    def draw(self, workload: Workload, upstream: torch.Tensor | None = None, runs: int = 1) -> Answer:
-        """The picture, and the gradients for ``upstream`` [H, W, 3].
-
-        Raises:
-            RendererFailed: if it hangs, dies, refuses, or returns something else.
-        """
+    def start(self) -> None:
+        """Start its process, unless it runs. Raises RendererFailed if what draws cannot be imported there."""
         if self.process is None:
             context = multiprocessing.get_context("spawn")
             self.connection, other = context.Pipe()
@@ -58,6 +54,14 @@ class Renderer:
             self.process.start()
             other.close()
             self._receive(START_LIMIT, serves=False)
+
+    def draw(self, workload: Workload, upstream: torch.Tensor | None = None, runs: int = 1) -> Answer:
+        """The picture, and the gradients for ``upstream`` [H, W, 3].
+
+        Raises:
+            RendererFailed: if it hangs, dies, refuses, or returns something else.
+        """
+        self.start()
         given = [tensor.numpy() for tensor in (*workload.gaussians, workload.background)]
         with suppress(OSError):  # it has died since the last answer
             self.connection.send((given, workload.camera, None if upstream is None else upstream.numpy(), runs))
@@ -105,7 +109,7 @@ def function_of(place: str):
     module, _, name = place.partition(":")
     try:
         function = getattr(importlib.import_module(module), name)
-    except (Exception, SystemExit) as error:  # whatever a module of others does when it is imported
+    except BaseException as error:  # whatever a module of others does when it is imported
         raise InputError(f"{place}: expected MODULE:function that can be imported, found {error!r}.") from error
     if not callable(function):
         raise InputError(f"{place}: expected a function, found {type(function).__name__}.")

@@ -138,6 +138,12 @@ def gaussians_file(path: str | Path, iteration: int) -> Path:
     return Path(path) if is_file_of_gaussians(path) else ply_path(path, iteration)
 
 
+def folder_of(path: str | Path) -> Path:
+    """The model folder in which a file lies where training puts it; else the path itself."""
+    place = Path(os.path.abspath(path))
+    return place.parents[2] if place.match(AS_SAVED) else Path(path)
+
+
 def open_model(
     path: str | Path, iteration: int = -1, crop: Sequence[float] = (), report: Report = print
 ) -> tuple[int, SplatFile, dict]:
@@ -154,11 +160,10 @@ def open_model(
     path = Path(path)
     iteration = 0 if is_file_of_gaussians(path) else find_iteration(path, iteration)
     found = load_gaussians(gaussians_file(path, iteration), report)
-    place = Path(os.path.abspath(path))
-    args = (place.parents[2] if place.match(AS_SAVED) else path) / "cfg_args"
+    args = folder_of(path) / "cfg_args"
     options = read_cfg_args(args.parent) if args.exists() else {"eval": True}
-    if options.get("projection", PROJECTIONS[0]) not in PROJECTIONS:
-        raise InputError(f"{args}: expected a projection of {', '.join(PROJECTIONS)}, found another; correct it there.")
+    if (projection := options.get("projection", PROJECTIONS[0])) not in PROJECTIONS:
+        raise InputError(f"{args}: expected a projection of {', '.join(PROJECTIONS)}, found {projection!r:.40}.")
     options = {"antialiasing": found.antialiased, "linear_light": found.linear, **options}
     marks = {"antialiased": bool(options["antialiasing"]), "linear": bool(options["linear_light"])}
     return iteration, found._replace(splats=cropped(found.splats, crop), **marks), options
@@ -258,8 +263,8 @@ def read_refined(path: str | Path, iteration: int) -> dict[str, Camera]:
     Raises:
         InputError: if the file is damaged.
     """
-    place = Path(os.path.abspath(gaussians_file(path, iteration)))
-    return dict(read_cameras(place.parent)) if place.match(AS_SAVED) else {}
+    file = gaussians_file(path, iteration)
+    return dict(read_cameras(file.parent)) if folder_of(file) != file else {}
 
 
 def write_environment(ply: Path, harmonics: np.ndarray | None) -> None:

@@ -61,8 +61,7 @@ def save_video(path: str | Path, frames: Iterable[np.ndarray], fps: float) -> No
     import av  # noqa: PLC0415 - large, and only films need it
 
     frames = iter(frames)
-    first = next(frames, None)
-    if first is None:
+    if (first := next(frames, None)) is None:
         raise InputError("frames: expected at least one image, got none.")
     check_image(first)
     height, width, _ = first.shape

@@ -109,8 +109,7 @@ def _match_files(subject: Subject) -> Iterator[Finding]:
     for image in registered:
         check = "files"
         try:
-            path = finder.find(image.name)
-            if path is None:
+            if (path := finder.find(image.name)) is None:
                 missing.append(image.name)
                 continue
             size = images.read_size(path)

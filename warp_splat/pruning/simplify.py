@@ -12,7 +12,7 @@ from warp_splat.errors import InputError
 from warp_splat.evaluation.metrics import psnr
 from warp_splat.evaluation.report import BLUE, GREEN, ORANGE, new_panels, plain_axes, save_figure
 from warp_splat.formats.files import write_csv
-from warp_splat.formats.model_folder import is_file_of_gaussians
+from warp_splat.formats.model_folder import folder_of, is_file_of_gaussians
 from warp_splat.formats.splats import COEFFICIENTS, SplatArrays, sizes
 from warp_splat.pruning.opened import Opened, output_of, print_quality, require_some, write, written_bytes
 from warp_splat.pruning.thinning import Thinning, fewer_harmonics, model_of, tuned
@@ -34,7 +34,8 @@ def simplify(config: SimplifyConfig) -> int:
     """
     _check(config)
     output = output_of(config.model, config.output, "simplified.ply")
-    if is_file_of_gaussians(config.model) and not config.source_path:
+    known = config.source_path or (folder_of(config.model) / "cfg_args").exists()
+    if is_file_of_gaussians(config.model) and not known:
         return _unseen(config, output)
     opened = Opened(config)
     if config.tolerance and opened.harmonics is not None:

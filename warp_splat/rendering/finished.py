@@ -14,7 +14,7 @@ from warp_splat.config import RasterOptions
 from warp_splat.errors import InputError
 from warp_splat.formats.coordinates import read_coordinates
 from warp_splat.formats.exposures import Exposures, read_exposures
-from warp_splat.formats.model_folder import is_file_of_gaussians, open_model, read_environment, read_refined
+from warp_splat.formats.model_folder import folder_of, open_model, read_environment, read_refined
 from warp_splat.formats.splats import SplatFile
 from warp_splat.gaussians import GaussianModel
 from warp_splat.raster.api import RenderOutput
@@ -58,8 +58,7 @@ class Finished:
 
     def placed(self) -> SplatFile:
         """Its Gaussians, and where they are in the world. Raises InputError if ``coordinates.json`` is damaged."""
-        where = self.file.coordinates if is_file_of_gaussians(self.path) else read_coordinates(self.path)
-        return self.file._replace(coordinates=where)
+        return self.file._replace(coordinates=read_coordinates(folder_of(self.path)) or self.file.coordinates)
 
     @property
     def beyond_files(self) -> list[str]:
@@ -105,7 +104,7 @@ class Finished:
         Raises:
             InputError: as :func:`warp_splat.load_scene`, or if it is not known which scene that is.
         """
-        trained, trained_on = self.trained, str(self.trained.get("source_path", ""))
+        trained, trained_on = self.trained, str(self.trained.get("source_path") or "")
         if not (source := source_path or trained_on):
             raise InputError(f"{self.path}: it does not say what it was trained on; name the scene with -s.")
         if trained_on and os.path.abspath(source) != os.path.abspath(trained_on):

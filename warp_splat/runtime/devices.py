@@ -23,8 +23,7 @@ def choose_device(name: str) -> torch.device:
     """
     if name == "cpu":
         return torch.device("cpu")
-    problem = why_no_cuda()
-    if problem is None:
+    if (problem := why_no_cuda()) is None:
         return torch.device("cuda", torch.cuda.current_device())
     if name == "cuda":
         raise InputError(f"--device cuda: {problem}, or use --device cpu.")

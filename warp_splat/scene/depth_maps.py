@@ -36,18 +36,19 @@ def read_inverse_depths(scene: Scene, folder: str) -> dict[View, np.ndarray]:
         folder: in the scene's, or anywhere.
 
     Raises:
-        InputError: if a map or its parameters are missing, not readable, or do not fit the photograph.
+        InputError: if a map or its parameters are missing, not readable, or do not fit the photograph; if all say
+            nothing.
     """
     source = scene.source or Path()
     paths = {view: _find(source / folder, view) for view in scene.train}
     fits = _read_fits(source / PARAMETERS, [Path(v.name).with_suffix("").as_posix() for v in scene.train], paths)
     median = float(np.median([fit.scale for fit in fits if fit.scale > 0] or [1.0]))
     low, high = (share * median for share in NEAR_MEDIAN)
-    return {
-        view: _read(path, view, fit)
-        for (view, path), fit in zip(paths.items(), fits, strict=True)
-        if low <= fit.scale <= high
-    }
+    chosen = zip(paths.items(), fits, strict=True)
+    found = {view: _read(path, view, fit) for (view, path), fit in chosen if low <= fit.scale <= high}
+    if not any((numbers >= 0).any() for numbers in found.values()):
+        raise InputError(f"--depths {folder}: expected maps of 1 / depth, found scales or numbers below 0; fit them.")
+    return found
 
 
 def _find(folder: Path, view: View) -> Path:

@@ -138,8 +138,7 @@ def _photo(values: dict[str, Any], path: Path, finder: ImageFinder, sampling: Sa
         photo = make_photo(name, path, lens, pose, size, sampling)
     if values.get("mask_path") is None:
         return photo
-    mask = finder.find(_path(values, "mask_path", where))
-    if mask is None:
+    if (mask := finder.find(_path(values, "mask_path", where))) is None:
         raise InputError(f"{where}: expected the mask {values['mask_path']!r:.200}, found no such file; copy it there.")
     return replace(photo, mask=mask)
 
@@ -186,8 +185,7 @@ def _points(source: Path, name: Any, report: Report) -> tuple[np.ndarray, np.nda
     """The points of nerfstudio's ``ply_file_path``; none without."""
     if name is None:
         return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
-    path = ImageFinder(source).find(_path({"ply_file_path": name}, "ply_file_path", source / ALL))
-    if path is None:
+    if (path := ImageFinder(source).find(_path({"ply_file_path": name}, "ply_file_path", source / ALL))) is None:
         raise InputError(
             f"{source / ALL}: expected the points {name!r:.200}, found no such file; copy it there, or remove the key "
             "ply_file_path to start from random points."

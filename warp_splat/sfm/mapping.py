@@ -229,8 +229,7 @@ def joined(
             mine, theirs = set(model.reg_image_ids()), set(other.reg_image_ids())
             if theirs <= mine or len(theirs & mine) < SHARED:
                 continue
-            model_from_other = pycolmap.align_reconstructions_via_reprojections(other, model)
-            if model_from_other is None:
+            if (model_from_other := pycolmap.align_reconstructions_via_reprojections(other, model)) is None:
                 continue
             other.transform(model_from_other)
             model = _with_cameras(model, other, database)
