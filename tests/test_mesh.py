@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from hostile import refusal
 from scene_files import write_image
 from scipy.spatial.transform import Rotation
 
@@ -15,11 +16,12 @@ from warp_splat import RasterOptions, rasterize
 from warp_splat.camera import Camera
 from warp_splat.cli import main
 from warp_splat.color import from_srgb
+from warp_splat.config import MeshConfig
 from warp_splat.formats.exchange import save_gaussians
 from warp_splat.formats.exposures import Exposures
 from warp_splat.formats.splats import SplatArrays, SplatFile
 from warp_splat.lenses import Lens
-from warp_splat.meshing.command import photographed, smoothed, surface_in, without_islands
+from warp_splat.meshing.command import _grid, photographed, smoothed, surface_in, without_islands
 from warp_splat.meshing.fusion import Drawn, Surface, agreed, depth_of, pixel, surface_of, voxels_of
 from warp_splat.meshing.stereo import filled
 from warp_splat.rendering.finished import as_photographed
@@ -78,6 +80,12 @@ def test_balls_far_from_the_origin(places):
     assert np.abs(np.linalg.norm(rays, axis=1) - 1).max() < VOXEL
     mesh = trimesh.Trimesh(rays, found.faces, process=False)
     assert mesh.is_winding_consistent and mesh.volume == pytest.approx(4 / 3 * np.pi * len(places), rel=0.03)
+
+
+def test_scenes_that_are_too_wide_are_refused(monkeypatch):
+    monkeypatch.setattr("warp_splat.meshing.command.voxels_of", lambda *_: torch.tensor([[0, 0, 0], [1 << 21, 0, 0]]))
+    config = MeshConfig(model="model", output="a.ply", voxel=1.0)
+    refusal(lambda: _grid(config, 1.0, [ball(0)], 1e9), "--voxel 1: expected at most 2097152 along an axis")
 
 
 def test_a_disc_is_where_rays_meet_its_plane():

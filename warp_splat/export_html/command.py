@@ -57,9 +57,7 @@ def export_html(config: ExportHtmlConfig) -> int:
     if model_folder.read_environment(config.model, iteration) is not None:
         print("  The page does not have what was learned behind the Gaussians (--parts sky): it is black there.")
     if trained.get("projection") == "unscented":
-        print(
-            "  The page draws by the affine projection, not by the unscented one of the training: it looks different."
-        )
+        print("  The page draws by the affine projection, not by the unscented one of the training: it differs.")
     if bent := sum(camera.lens is not None for _, camera in cameras):
         print(f"  {bent} cameras have lenses with distortion; the page shows what pinholes would see from there.")
     if rolling := sum(camera.shutter is not None for _, camera in cameras):

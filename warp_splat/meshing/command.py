@@ -19,7 +19,7 @@ from warp_splat.formats.exposures import Exposures
 from warp_splat.formats.files import write_bytes
 from warp_splat.formats.model_folder import check_output
 from warp_splat.gaussians import GaussianModel
-from warp_splat.meshing.fusion import Drawn, Surface, agreed, depth_of, image_at, pixel, surface_of, voxels_of
+from warp_splat.meshing.fusion import HALF, Drawn, Surface, agreed, depth_of, image_at, pixel, surface_of, voxels_of
 from warp_splat.meshing.stereo import filled
 from warp_splat.pruning.opened import Opened
 from warp_splat.raster.api import render
@@ -136,6 +136,8 @@ def _grid(config: MeshConfig, natural: float, views: Sequence[Drawn], memory: fl
         voxels = voxels_of(views, voxel, config.crop)
         if not len(voxels) or voxel * PIXELS > natural * min(views[0].depth.shape):  # what a view shows
             raise InputError(f"--voxel {voxel:g}: nothing is seen at this size, or in the box; try {natural:.2g}.")
+        if (voxels.amax(0) - voxels.amin(0)).max() >= 2 * HALF:
+            raise InputError(f"--voxel {voxel:g}: expected at most {2 * HALF} along an axis; raise it, or crop.")
         ends = [(int(axis.min()) - 1, int(axis.max()) + 2) for axis in voxels.T if config.watertight]
         count = math.prod(end - begin for begin, end in ends) if ends else len(voxels)
         if count <= memory / VOXEL:
