@@ -85,7 +85,7 @@ def test_balls_far_from_the_origin(places):
 def test_scenes_that_are_too_wide_are_refused(monkeypatch):
     monkeypatch.setattr("warp_splat.meshing.command.voxels_of", lambda *_: torch.tensor([[0, 0, 0], [1 << 21, 0, 0]]))
     config = MeshConfig(model="model", output="a.ply", voxel=1.0)
-    refusal(lambda: _grid(config, 1.0, [ball(0)], 1e9), "--voxel 1: expected at most 2097152 along an axis")
+    refusal(lambda: _grid(config, 1.0, [ball(0)], 1e9), "--voxel 1: it takes more than 2097152 along an axis")
 
 
 def test_a_disc_is_where_rays_meet_its_plane():

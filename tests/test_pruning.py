@@ -267,12 +267,17 @@ def test_simplify_within_a_tolerance(folder, tmp_path, capsys):
     assert len(left.means) < len(splats.means)
 
 
-def test_simplify_without_a_scene_keeps_the_opaque_and_large(tmp_path, capsys):
+@pytest.mark.parametrize("gone", ["", "/nowhere/scene"])
+def test_simplify_without_a_scene_keeps_the_opaque_and_large(tmp_path, capsys, gone):
+    """Also a file in a model's folder whose scene is not there."""
+    path = ply_path(tmp_path, 1) if gone else tmp_path / "a.ply"
+    if gone:
+        write_cfg_args(tmp_path, {"source_path": gone})
     camera = make_camera(*SIZE, seed=3)
     splats = splats_before(camera)
     splats.opacities[::2] = -5
-    save_gaussians(tmp_path / "a.ply", SplatFile(splats))
-    assert main(["simplify", str(tmp_path / "a.ply"), "--keep", "0.5", "-o", str(tmp_path / "b.glb")]) == 0
+    save_gaussians(path, SplatFile(splats))
+    assert main(["simplify", str(path), "--keep", "0.5", "-o", str(tmp_path / "b.glb")]) == 0
     assert "Without a scene" in capsys.readouterr().out
     np.testing.assert_allclose(load_gaussians(tmp_path / "b.glb").splats.means, splats.means[1::2], atol=1e-6)
 

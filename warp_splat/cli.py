@@ -90,8 +90,7 @@ def parse(arguments: list[str]) -> Any:
             number out of its bounds; for a configuration file that is not one.
     """
     for argument in arguments:
-        name = argument.split("=")[0]
-        if name in FOREIGN_FLAGS:
+        if (name := argument.split("=")[0]) in FOREIGN_FLAGS:
             raise InputError(f"{name}: {FOREIGN_FLAGS[name]}; leave this flag out.")
     spaced = [f" {word}" if UNUSUAL.fullmatch(word) else word for word in arguments]
     known, unknown = make_parser().parse_known_args(spaced)

@@ -136,14 +136,14 @@ def _grid(config: MeshConfig, natural: float, views: Sequence[Drawn], memory: fl
         voxels = voxels_of(views, voxel, config.crop)
         if not len(voxels) or voxel * PIXELS > natural * min(views[0].depth.shape):  # what a view shows
             raise InputError(f"--voxel {voxel:g}: nothing is seen at this size, or in the box; try {natural:.2g}.")
-        if (voxels.amax(0) - voxels.amin(0)).max() >= 2 * HALF:
-            raise InputError(f"--voxel {voxel:g}: expected at most {2 * HALF} along an axis; raise it, or crop.")
         ends = [(int(axis.min()) - 1, int(axis.max()) + 2) for axis in voxels.T if config.watertight]
         count = math.prod(end - begin for begin, end in ends) if ends else len(voxels)
-        if count <= memory / VOXEL:
+        wide = (voxels.amax(0) - voxels.amin(0)).max() >= 2 * HALF
+        if count <= memory / VOXEL and not wide:
             return voxel, torch.cartesian_prod(*(torch.arange(*x, dtype=torch.int32) for x in ends)) if ends else voxels
         if config.voxel:
-            raise InputError(f"--voxel {voxel:g}: it takes {2e-9 * count * VOXEL:.1f} GB; raise it, or --memory.")
+            found = f"more than {2 * HALF} along an axis" if wide else f"{2e-9 * count * VOXEL:.1f} GB"
+            raise InputError(f"--voxel {voxel:g}: it takes {found}; raise it, or --memory.")
         voxel *= COARSER
 
 

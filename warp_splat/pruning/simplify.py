@@ -1,5 +1,6 @@
 """``warp-splat simplify``: a finished model in fewer Gaussians and harmonics, to a share, a loss or a size of file."""
 
+import os
 import re
 import time
 from collections.abc import Callable
@@ -12,7 +13,7 @@ from warp_splat.errors import InputError
 from warp_splat.evaluation.metrics import psnr
 from warp_splat.evaluation.report import BLUE, GREEN, ORANGE, new_panels, plain_axes, save_figure
 from warp_splat.formats.files import write_csv
-from warp_splat.formats.model_folder import folder_of, is_file_of_gaussians
+from warp_splat.formats.model_folder import folder_of, is_file_of_gaussians, read_cfg_args
 from warp_splat.formats.splats import COEFFICIENTS, SplatArrays, sizes
 from warp_splat.pruning.opened import Opened, output_of, print_quality, require_some, write, written_bytes
 from warp_splat.pruning.thinning import Thinning, fewer_harmonics, model_of, tuned
@@ -34,8 +35,9 @@ def simplify(config: SimplifyConfig) -> int:
     """
     _check(config)
     output = output_of(config.model, config.output, "simplified.ply")
-    known = config.source_path or (folder_of(config.model) / "cfg_args").exists()
-    if is_file_of_gaussians(config.model) and not known:
+    args = folder_of(config.model) / "cfg_args"
+    scene = read_cfg_args(args.parent).get("source_path") if args.exists() else ""
+    if is_file_of_gaussians(config.model) and not (config.source_path or os.path.exists(str(scene or ""))):
         return _unseen(config, output)
     opened = Opened(config)
     if config.tolerance and opened.harmonics is not None:

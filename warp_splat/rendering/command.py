@@ -163,8 +163,7 @@ def _check(config: RenderConfig) -> None:
         raise InputError(f"--frames {config.frames}: expected --video beside it.")
     if config.orbit_center and not (config.orbit or config.video == "orbit"):
         raise InputError(f"--orbit_center {config.orbit_center}: expected --orbit or --video orbit beside it.")
-    suffix = Path(config.video_output).suffix.lower()
-    if suffix in OTHER_VIDEOS:
+    if (suffix := Path(config.video_output).suffix.lower()) in OTHER_VIDEOS:
         raise InputError(f"--video_output {config.video_output}: expected .mp4 or a folder, found {suffix}; rename it.")
 
 
