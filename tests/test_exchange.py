@@ -111,9 +111,8 @@ def test_marks_are_kept_or_said_to_be_lost(tmp_path, ending):
 @pytest.mark.parametrize("axes", MIRRORS)
 def test_half_turns_and_back_give_the_same_bytes(axes):
     before = some_splats()
-    there = turned(before, frame(axes).T)
+    after = turned(there := turned(before, frame(axes).T), frame(axes))
     np.testing.assert_array_equal(there.means, before.means * np.float32(MIRRORS[axes]))
-    after = turned(there, frame(axes))
     for name in ("means", "sh", "opacities", "scales"):
         np.testing.assert_array_equal(getattr(before, name), getattr(after, name))
     np.testing.assert_array_equal(np.abs(before.quats), np.abs(after.quats))
@@ -147,9 +146,8 @@ def test_gltf_holds_what_the_extension_says(tmp_path, ending):
     assert len(found) == 5 + 16
     np.testing.assert_array_equal(found["POSITION"], wanted.means)
     bounds = document["accessors"][primitive["attributes"]["POSITION"]]
-    np.testing.assert_array_equal(
-        np.float32([bounds["min"], bounds["max"]]), [wanted.means.min(0), wanted.means.max(0)]
-    )
+    for side in ("min", "max"):
+        np.testing.assert_array_equal(np.float32(bounds[side]), getattr(wanted.means, side)(0))
     np.testing.assert_allclose(found[f"{NAME}:SCALE"], np.exp(wanted.scales), rtol=1e-6)
     np.testing.assert_allclose(found[f"{NAME}:OPACITY"], sigmoid(wanted.opacities), rtol=1e-5)
     unit = wanted.quats / np.linalg.norm(wanted.quats, axis=1, keepdims=True)
@@ -163,8 +161,7 @@ def test_gltf_holds_what_the_extension_says(tmp_path, ending):
 
 def place(tmp_path, nodes, **more):
     """A file whose mesh stands where ``nodes`` say."""
-    file = some_file(10)
-    save_gaussians(tmp_path / "a.glb", file, report=silent)
+    save_gaussians(tmp_path / "a.glb", file := some_file(10), report=silent)
     document, binary = glb_parts(tmp_path / "a.glb")
     (tmp_path / "b.glb").write_bytes(glb_bytes({**document, "nodes": nodes, **more}, binary))
     return file.splats
@@ -192,7 +189,7 @@ def test_gltf_pieces_are_joined(tmp_path):
     np.testing.assert_array_equal(after.means, np.concatenate([before.means, before.means - [5, 0, 0]]).astype("f4"))
 
 
-def test_gltf_pieces_of_both_lights_are_refused(tmp_path):
+def test_gltf_pieces_of_both_lights_are_refused(tmp_path, capsys):
     place(tmp_path, [{"mesh": 0}])
     document, binary = glb_parts(tmp_path / "a.glb")
     first, second = copy.deepcopy(document["meshes"]), copy.deepcopy(document["meshes"])
@@ -200,8 +197,11 @@ def test_gltf_pieces_of_both_lights_are_refused(tmp_path):
     second[0]["primitives"][0]["extensions"][NAME]["colorSpace"] = "lin_rec709_display"
     (tmp_path / "b.glb").write_bytes(glb_bytes(whole, binary))
     refusal(lambda: load_gaussians(tmp_path / "b.glb"), "some are in linear light and some are not")
-    (tmp_path / "b.glb").write_bytes(glb_bytes({**whole, "meshes": 2 * second}, binary))
+    mixed = copy.deepcopy(second)
+    mixed[0]["primitives"][0]["extensions"][NAME]["extras"] = {"SplatRenderMode": "mip"}
+    (tmp_path / "b.glb").write_bytes(glb_bytes({**whole, "meshes": second + mixed}, binary))
     assert Finished(tmp_path / "b.glb").is_linear(SimpleNamespace(linear=False))
+    assert "only some of its parts are antialiased" in capsys.readouterr().out
 
 
 def test_gltf_quantized_attributes(tmp_path):

@@ -235,6 +235,9 @@ def test_open_model(tmp_path, mark, monkeypatch, fails, capsys):
     model_folder.write_cfg_args(folder, {"projection": "unscented"})
     assert main(["export-html", str(folder), str(tmp_path / "a.html")]) == 0
     assert "not by the unscented one" in capsys.readouterr().out
+    model_folder.write_cameras(folder, [], [view("1.jpg", 1)])
+    assert main(["export-html", "point_cloud.ply", str(tmp_path / "a.html")]) == 0
+    assert " 1 cameras" in capsys.readouterr().out
     model_folder.write_cfg_args(folder, {"projection": "fisheye"})
     message = fails("render", "-m", folder)
     assert "cfg_args: expected a projection of affine, ellipsoid, unscented, found 'fisheye'" in message
@@ -247,6 +250,7 @@ def test_open_model(tmp_path, mark, monkeypatch, fails, capsys):
         ("--orbit --bound", "--bound: expected views"),
         ("--video path --orbit_center origin", "--orbit_center origin: expected --orbit or --video orbit"),
         ("--device cpu", "name the scene with -s"),
+        ("--iteration 7", "expected a model folder for iteration 7, found a file"),
     ],
 )
 def test_what_render_makes_of_a_file_alone(tmp_path, fails, options, sentence):

@@ -132,7 +132,10 @@ def test_only_what_is_to_be_drawn_is_read(tmp_path):
     expected = turned(turned(splats, np.eye(3), np.array([0.0, 4, 6])), HALF_TURN)  # mirrored twice
     same(found._replace(**{name: getattr(found, name)[6:] for name in found._fields}), expected)
     UsdGeom.PointInstancer.Define(stage, "/forest"), add(stage, "/forest/tree", splats), stage.Save()
-    assert len(load_gaussians(tmp_path / "a.usda", lines.append).splats.means) == 16
+    stage.GetPrimAtPath("/part0").SetCustomDataByKey("SplatRenderMode", "mip"), stage.Save()
+    file = load_gaussians(tmp_path / "a.usda", lines.append)
+    assert (len(file.splats.means), file.antialiased) == (16, False)
+    assert "only some of its parts are antialiased; all are drawn as if none were" in lines.pop()
     assert len(lines) == 1 and "its point instancers repeat nothing here" in lines[0]
 
 

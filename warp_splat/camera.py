@@ -90,8 +90,7 @@ class Camera:
                     "pixels; use one that shows all around."
                 )
         if self.shutter is not None:
-            share = abs(self.shutter.turn[0]) * self.fy / self.height
-            if share > MOST_SHARE:
+            if (share := abs(self.shutter.turn[0]) * self.fy / self.height) > MOST_SHARE:
                 raise InputError(
                     "Camera shutter: expected a turn that moves the picture up or down by at most half of its "
                     f"height while it is read, got {share:.2f}; check fy and the poses."
@@ -107,8 +106,7 @@ class Camera:
             InputError: if it turns by more than a radian, or moves the picture by more than half its height.
         """
         turned = last.rotation @ first.rotation.T
-        cosine = 0.5 * (np.trace(turned) - 1)
-        if cosine < 0:
+        if (cosine := 0.5 * (np.trace(turned) - 1)) < 0:
             raise InputError(
                 "Camera.rolling: expected a turn of at most 1 rad from the first row to the last, got "
                 f"{math.acos(max(cosine, -1)):.3g}; check the poses."

@@ -45,7 +45,7 @@ def audit(config: AuditConfig) -> int:
         try:  # in a process of its own, as modules of others change defaults, hang, or exit
             renderer.start()
         except RendererFailed as error:
-            raise InputError(f"{place}: expected what can be started, but it {error}.") from error
+            raise InputError(f"{place}: the renderer {error}.") from error
         out = prepare_folder(config.out)
         if config.case:
             return _write_case(renderer, config.degree, config.case, out)

@@ -60,15 +60,13 @@ class Checkpoint:
 
     def fact(self, name: str, kind: type) -> Any:
         """A value of exactly this type."""
-        found = self.facts.get(name)
-        if type(found) is not kind:
+        if type(found := self.facts.get(name)) is not kind:
             raise InputError(f"{self.path}: expected {name!r} as {kind.__name__}, found {found!r:.50}; name another.")
         return found
 
     def count(self, name: str) -> int:
         """A whole number, 0 to 2^63 - 1."""
-        found = self.fact(name, int)
-        if not 0 <= found < 2**63:
+        if not 0 <= (found := self.fact(name, int)) < 2**63:
             raise InputError(f"{self.path}: expected {name!r} as 0 to 2^63 - 1, found another; start from another one.")
         return found
 

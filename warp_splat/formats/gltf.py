@@ -27,6 +27,7 @@ AXES = "LUF"
 UNDERSTOOD = {NAME, "KHR_mesh_quantization"}  # extensions that a file may require
 COLOR_SPACES = ("srgb_rec709_display", "lin_rec709_display")  # as photographs have it; in linear light
 RENDER_MODE = "SplatRenderMode"
+SOME_MIP = "only some of its parts are antialiased; all are drawn as if none were"
 COORDINATES = "coordinates"
 MOST_PIECES = 4096  # meshes; the Gaussians of a scene are one or a few
 LEAST_BYTES = 23  # of a Gaussian: bytes for position, rotation, scale and opacity, three floats for the color
@@ -100,10 +101,11 @@ def load_gltf(path: str | Path, report: Report = print) -> SplatFile:
         linear = {extension.get("colorSpace") == COLOR_SPACES[1] for extension in told}
         if len(linear) > 1:
             raise Unexpected("meshes of which some are in linear light and some are not; export them alike")
+        mip = [_extra(extension, RENDER_MODE) == "mip" for extension in told]
+        notes += [SOME_MIP] * (any(mip) and not all(mip))
     for note in dict.fromkeys(notes):
         report(f"{path}: {note}.")
-    antialiased = all(_extra(extension, RENDER_MODE) == "mip" for extension in told)
-    return SplatFile(concatenated(parts), antialiased, kept(_extra(document.json, COORDINATES)), linear.pop())
+    return SplatFile(concatenated(parts), all(mip), kept(_extra(document.json, COORDINATES)), linear.pop())
 
 
 def _attributes(splats: SplatArrays, in_linear: bool, report: Report) -> dict[str, np.ndarray]:

@@ -155,10 +155,12 @@ def open_model(
     :func:`warp_splat.formats.exchange.load_gaussians`.
 
     Raises:
-        InputError: if there is no such model, it cannot be read, or was trained with an unknown projection.
+        InputError: if there is no such model (a file has no iterations), it cannot be read, or was trained with an
+            unknown projection.
     """
-    path = Path(path)
-    iteration = 0 if is_file_of_gaussians(path) else find_iteration(path, iteration)
+    if (is_file := is_file_of_gaussians(path)) and iteration != -1:
+        raise InputError(f"{path}: expected a model folder for iteration {iteration}, found a file; leave that out.")
+    iteration = 0 if is_file else find_iteration(path, iteration)
     found = load_gaussians(gaussians_file(path, iteration), report)
     args = folder_of(path) / "cfg_args"
     options = read_cfg_args(args.parent) if args.exists() else {"eval": True}

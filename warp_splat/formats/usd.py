@@ -22,7 +22,7 @@ import numpy as np
 from warp_splat.errors import InputError
 from warp_splat.formats.coordinates import kept
 from warp_splat.formats.files import Unexpected, atomic_write, reading
-from warp_splat.formats.gltf import COORDINATES, RENDER_MODE
+from warp_splat.formats.gltf import COORDINATES, RENDER_MODE, SOME_MIP
 from warp_splat.formats.splats import COEFFICIENTS, SplatArrays, SplatFile, concatenated, decompose, frame, turned
 from warp_splat.formats.stored import LOG_SCALES, clipped, log_scales, logit, sigmoid, unit_quats
 from warp_splat.text import Report
@@ -134,12 +134,13 @@ def load_usd(path: str | Path, report: Report = print) -> SplatFile:
             turn, translation, scale = decompose(world)
             splats = _read_prim(prim, now, notes.append)
             parts.append(turned(splats, axes @ turn, unit * (axes @ translation), unit * scale))
-        antialiased = all(prim.GetCustomDataByKey(RENDER_MODE) == "mip" for prim in prims)
+        mip = [prim.GetCustomDataByKey(RENDER_MODE) == "mip" for prim in prims]
+        notes += [SOME_MIP] * (any(mip) and not all(mip))
         told = stage.GetRootLayer().customLayerData.get(COORDINATES, "null")
         coordinates = kept(json.loads(told)) if isinstance(told, str) else None
     for note in dict.fromkeys(notes):
         report(f"{path}: {note}.")
-    return SplatFile(concatenated(parts), antialiased, coordinates)
+    return SplatFile(concatenated(parts), all(mip), coordinates)
 
 
 def _read_prim(prim, now, report: Report) -> SplatArrays:
