@@ -30,11 +30,15 @@ INTRODUCTION = """# Every flag
 What each command can be told, as `--help` says it. `python docs/make_pages.py` wrote this page. Flags that are on or
 off have a `--no-` form. Those of `warp-splat train` have [a page of their own](flags_train.md). `render.py` is
 `warp-splat render`, and `python -m warp_splat.compare` is `warp-splat compare`.
+
+Exit codes: 0; 1 for bad input, of which one sentence says what is wrong, and where `inspect` found an error, `audit` or
+`compare --stability` something that is off; 130 for a training that Ctrl-C ended, whose model is saved.
 """
 TRAINING = """# Every flag of a training
 
 What `uv run train.py` (which is `warp-splat train`) can be told, as its `--help` says it. `python docs/make_pages.py`
 wrote this page. Flags that are on or off have a `--no-` form. The other commands have theirs [here](flags.md).
+A few flags of the reference are refused, with the reason: `--debug`, `--ip`, `--train_test_exp` and others.
 """
 PRESET_TEXT = """# What presets change
 

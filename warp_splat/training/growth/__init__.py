@@ -11,8 +11,8 @@ from warp_splat.training.seams import Entry
 class ReferenceOptions:
     """Densification of the reference (Kerbl et al. 2023), with its names and defaults; others take its schedule."""
 
-    densify_from_iter: int = growing(500, "first step of densification", least=-1, schedule=True)
-    densify_until_iter: int = growing(15_000, "last step of densification", least=-1, schedule=True)
+    densify_from_iter: int = growing(500, "densify after this step", least=-1, schedule=True)
+    densify_until_iter: int = growing(15_000, "densify before this step", least=-1, schedule=True)
     densification_interval: int = growing(100, "steps between two densifications", least=1)
     densify_grad_threshold: float = growing(0.0002, "mean gradient of the 2D mean (NDC units) above which to densify")
     percent_dense: float = growing(0.01, "share of the scene's extent above which a Gaussian splits, and is not cloned")
