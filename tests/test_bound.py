@@ -115,6 +115,25 @@ def test_random_scenes(options, seed, count, largest, opacity, aspect, bright, b
     ratios(gaussians, camera, torch.full((3,), behind), RasterOptions(**options))
 
 
+@pytest.mark.parametrize("options", [{}, {"alpha_min": 0.05}, {"tolerance": 0.01}])
+@pytest.mark.parametrize("blur", [1e-6, 1e-3, 0.02])
+def test_what_is_narrower_than_the_way_between_two_pixels(blur, options):
+    camera = make_camera(24, 20, seed=None)
+    for seed in range(12):
+        gaussians = made_up(seed, 3, (0.01, 0.5), (0.9, 1.0), 0.9, 1.0, camera)
+        ratios(gaussians, camera, torch.zeros(3), RasterOptions(blur=blur, **options))
+
+
+def test_what_may_be_left_out_counts_as_bright_as_its_harmonics_make_it():
+    """An alpha that rounding may put on either side of 1/255."""
+    camera, opacity = make_camera(41, 37, seed=None), 1.00005 * ALPHA_MIN
+    gaussians = made_up(1, 1, (0.5, 0.6), (opacity, opacity), 0.9, 0.0, camera)
+    rest = torch.zeros_like(gaussians.sh_rest)
+    rest[:, 1] = 1.0  # along z
+    gaussians = gaussians._replace(means=torch.tensor([[0.0, 0.0, 5.0]]), sh_rest=rest)
+    ratios(gaussians, camera, torch.zeros(3), RasterOptions(tolerance=0.1, of="trained", sh_degree=0))
+
+
 def ordinary():
     camera = look(70, 50)
     return made_up(3, 400, (0.5, 6.0), (0.05, 0.9), 0.2, 1.0, camera), camera

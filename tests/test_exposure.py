@@ -261,12 +261,13 @@ def trained(tmp_path_factory):
     return folder, file
 
 
-def test_render_shows_photographs_as_they_were_taken(trained):
-    """By a gain on value + 0.055 in float64; and as the mean photograph where there is no file."""
+def test_render_shows_photographs_as_they_were_taken(trained, capsys):
+    """By a gain on value + 0.055 in float64; and as the mean photograph where there is no file. A bound is before."""
     (folder, file), written = trained, []
     for name in ("exposures.json", "away.json"):
         file.rename(file.with_name(name))
-        assert main(["render", "-m", str(folder)]) == 0
+        assert main(["render", "-m", str(folder), "--bound"]) == 0
+        assert (" (before exposures): " in capsys.readouterr().out) == (name == "exposures.json")
         written.append([load_png(folder / f"train/ours_6/renders/{place:05d}.png") for place in (0, 1)])
         file.with_name(name).rename(file)
     renders, neutral = written

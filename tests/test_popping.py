@@ -6,6 +6,7 @@ import torch
 from warp_splat.compare import oracle
 from warp_splat.compare.scenes import cloud, look, tensors
 from warp_splat.config import RasterOptions
+from warp_splat.raster.api import render
 from warp_splat.raster.data import Gaussians
 from warp_splat.rendering import popping
 from warp_splat.rendering.popping import popping_of
@@ -66,6 +67,22 @@ def test_of_two_it_is_what_exchanging_them_changes():
     change = (blended(alphas, colors, [0, 1]) - blended(alphas, colors, [1, 0])).abs().amax(1)
     found = popping_of(gaussians, camera, RasterOptions()).flatten().double()
     assert (found - change).abs().max() < 1e-3 * change.max()
+
+
+def test_within_a_tolerance_what_is_too_faint_for_the_usual_cut_counts():
+    """Wide layers close to each other, dark before bright and the other way round."""
+    camera, count, options = look(40, 36), 400, RasterOptions(tolerance=0.01)
+    gaussians = Gaussians(*(tensor[:1].expand(count, *tensor.shape[1:]) for tensor in scene(4, 2, (6.0, 7.0), camera)))
+    forward = torch.tensor(camera.rotation[2], dtype=torch.float32)
+    means = gaussians.means + torch.linspace(0.0, 1e-3, count)[:, None] * forward
+    dark = torch.where(torch.arange(count) < count // 2, -1.7, 1.7)[:, None, None].expand(count, 1, 3)
+    gaussians = gaussians._replace(means=means, sh_dc=dark, opacities=torch.full((count,), 0.0039))
+    first, second = (
+        render(gaussians._replace(means=order), camera, torch.zeros(3), options).image
+        for order in (means, means.flip(0))
+    )
+    change = (first - second).abs().amax(2)
+    assert 0.1 < change.max() and (change <= popping_of(gaussians, camera, options) + 1e-3).all()
 
 
 def test_apart_nothing_changes():

@@ -56,9 +56,10 @@ class BoundView:
     begins: wp.array[float]  # [K] depths at which the maps begin; the first is below all
     errors: wp.array[wp.vec3]  # [V] of splats: of alpha, relative; of alpha that is faint, or at the floor; of color
     brightest: float  # of all colors and the background
+    shade: float  # the largest error of a color
     darkest: float  # of the background
     behind: float  # brightest of the background
-    everywhere: float  # alpha of all Gaussians outside their last box
+    everywhere: float  # light of all Gaussians outside their last box
     unknown: float  # Gaussians of whose place nothing is known
     bound_out: wp.array2d[float]  # [H, W]
     rounding_out: wp.array2d[float]  # [H, W] the part of it that is rounding
@@ -106,9 +107,9 @@ def outside_of(bound: BoundView, begin: int, end: int, tile: int, tiles_x: int, 
 
 
 @wp.func
-def brightness(color: wp.vec3, usual: float):
-    """What alpha of that color counts, in units of the usual; no less than 1."""
-    return wp.max(wp.max(color) / usual, 1.0)
+def brightness(color: wp.vec3, shade: float, usual: float):
+    """What alpha of that color, which may be off by ``shade``, counts, in units of the usual; no less than 1."""
+    return wp.max((wp.max(color) + shade) / usual, 1.0)
 
 
 @wp.func
@@ -162,7 +163,7 @@ def all_cuts(change: Any, taken: Any, added: Any, before: Any):
 def with_rest(cuts: Any, stopped: Any, bound: BoundView):
     """With what lies where a pixel ``stopped``, which is its transmittance there, and outside of the last boxes."""
     hidden = times(stopped, wp.max(bound.brightest - bound.darkest, bound.behind))
-    return (cuts + hidden + fill(bound.brightest * bound.everywhere, hidden)) * 1.001
+    return (cuts + hidden + fill(bound.everywhere, hidden)) * 1.001
 
 
 @wp.func
@@ -230,14 +231,15 @@ def make_beyond(fall_at: wp.Function) -> tuple[wp.Function, wp.Function]:
         return int(wp.ceil(most * fall_at(0.5 * LOG2_E * near * near)))
 
     @wp.func
-    def beyond(low: int, high: int, blocks: int, mean: float, deviation: float, most: float):
-        """The largest alpha outside of some of a row of blocks; nothing is outside the image."""
+    def beyond(low: int, high: int, blocks: int, mean: float, half: float, deviation: float, most: float):
+        """The largest alpha outside of the blocks with a center within ``half``; nothing is outside the image."""
         distance = float(1.0e30)
         if low > 0:
             distance = mean + 0.5 - BLOCK * float(low)
         if high < blocks:
             distance = wp.min(distance, BLOCK * float(high) + 0.5 - mean)
-        return wp.where(distance < 1.0e30, farther(distance / deviation, most), 0)
+        # between two centers, there may be no such block
+        return wp.where(distance < 1.0e30, farther(wp.max(distance, half) / deviation, most), 0)
 
     @wp.func
     def aside_of(root: wp.vec3, u: float, low: float, high: float, most: float):
@@ -318,13 +320,15 @@ def make_spread(falloff: FalloffFunctions) -> wp.Kernel:
                 ends_at = wp.where(outside, far, near)
                 most_error = wp.min(alpha_error(rules, condition, shift, 0.5 * ends_at), 1.0)
                 loose = 1.0 + most_error + most_error * most_error  # above its exponential
-                unsure = loose > wp.where(rules.floor > 0.0, 1.1, 2.0)  # the blend looks a tenth below a floor
+                margin = wp.min(0.1 * wp.min(sigma), 1.0e-2)
+                margin += 1.0e-6 * (wp.max(wp.abs(mean)) + wp.max(half))
+                # The blend looks a tenth below a floor. What is as narrow as the margin shows beside it, too.
+                unsure = loose > wp.where(rules.floor > 0.0, 1.1, 2.0) or margin > 0.25 * wp.min(sigma)
                 if unsure:
                     wp.atomic_add(lost_out, 0, 1)
                 counted = outside and not unsure
-                color = splats2d.colors[i] + wp.vec3(errors_out[i][2])
-                most = opacity * loose * brightness(color, rules.usual) * 1.001 / rules.unit
-                margin = 1.0e-2 + 1.0e-6 * (wp.max(wp.abs(mean)) + wp.max(splats2d.extents[i]))
+                most = opacity * loose * brightness(splats2d.colors[i], errors_out[i][2], rules.usual)
+                most = most * 1.001 / rules.unit
                 slack = wp.vec2(margin, margin)
                 alpha = wp.min(rules.seen, opacity)
                 if opacity >= rules.seen:
@@ -336,21 +340,21 @@ def make_spread(falloff: FalloffFunctions) -> wp.Kernel:
                         half = wp.vec2(side, side)
                 else:
                     half = wp.vec2(0.0)
-                inner = box_of(maps_out, mean, half - slack)
+                half = half - slack
+                inner = box_of(maps_out, mean, half)
                 if counted and opacity >= rules.seen and rules.square == 0:
                     add_corners(maps_out, here, depth, inner, mean, conic, sigma, near, most, margin)
                 carried = int(0)  # what the box before counts
                 for step in range(BOXES):
                     alpha = wp.where(step < BOXES - 1, wp.max(alpha * SHARE, rules.faint), rules.faint)
-                    wider = wp.max(sigma * wp.sqrt(reach_of(opacity, alpha)), half) + slack
+                    wider = wp.max(sigma * wp.sqrt(reach_of(opacity, alpha)) * 1.000001, half + slack) + slack
                     if counted:
-                        aside = beyond(inner[0], inner[1], maps_out.shape[3] - 1, mean[0], sigma[0], most)
-                        above = beyond(inner[2], inner[3], maps_out.shape[2] - 1, mean[1], sigma[1], most)
+                        aside = beyond(inner[0], inner[1], maps_out.shape[3] - 1, mean[0], half[0], sigma[0], most)
+                        above = beyond(inner[2], inner[3], maps_out.shape[2] - 1, mean[1], half[1], sigma[1], most)
                         outer = box_of(maps_out, mean, wider)
                         add_box(maps_out, here, depth, inner, carried - above)
                         add_box(maps_out, here, depth, wp.vec4i(inner[0], inner[1], outer[2], outer[3]), above - aside)
-                        inner = outer
-                        carried = aside
+                        inner, half, carried = outer, wider, aside
                 add_box(maps_out, here, depth, inner, carried)
 
     return spread

@@ -89,14 +89,26 @@ class CameraParameters:
         if self.here is not None:
             return self.here.camera
         fx, fy, cx, cy = _numbers(self.intrinsics)
-        lens = self.base.lens
-        if lens and self.coefficients is not None:
+        if (lens := self.base.lens) and self.coefficients is not None:
             lens = Lens(lens.model, tuple(_numbers(self.coefficients).tolist()))
         base = replace(self.base, fx=fx, fy=fy, cx=cx, cy=cy, lens=lens)
         if self.last_twist is None:
             return _twisted(base, "twist", self.twist)
         first = _twisted(base.at(-0.5), "twist", self.twist)
         return Camera.rolling(first, _twisted(base.at(base.height - 0.5), "last_twist", self.last_twist))
+
+    def center(self) -> torch.Tensor:
+        """Of the camera in the world [3], when its middle row is read; with gradients."""
+        ends = [(self.base, self.twist)]
+        if self.last_twist is not None:
+            ends = [(self.base.at(-0.5), self.twist), (self.base.at(self.base.height - 0.5), self.last_twist)]
+        return torch.stack([_center(*end) for end in ends]).mean(0)
+
+
+def _center(base: Camera, twist: torch.Tensor) -> torch.Tensor:
+    against = torch.linalg.cross(twist[:3].expand(3, 3), torch.eye(3).to(twist))  # the turn backwards
+    shift = torch.from_numpy(base.rotation.T.copy()).to(twist) @ torch.linalg.matrix_exp(against) @ twist[3:]
+    return torch.from_numpy(base.center).to(twist) - shift
 
 
 def _twisted(base: Camera, name: str, tensor: torch.Tensor) -> Camera:

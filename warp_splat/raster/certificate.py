@@ -119,9 +119,10 @@ def certify(
         "usual": usual,
         "begins": starts,
         "brightest": brightest,
+        "shade": float(errors[:, 2].max()),
         "darkest": float(background.min()),
         "behind": behind,
-        "everywhere": 0.0 if rules.floor else 2.0 * count * faint,
+        "everywhere": 0.0 if rules.floor else 2.0 * count * faint * max(brightest, 1.0),
         "unknown": float(lost),
         "floor": wp.vec2((1.0 - BAND) * ALPHA_MIN, SURE) if rules.floor else wp.vec2(faint),
     }

@@ -115,8 +115,7 @@ def check_hidden_from(options: RasterOptions, camera: Camera, device: torch.devi
 
 def check_tolerance(options: RasterOptions, features: object = None) -> None:
     """Raise InputError if the tolerance is no positive number, or if it asks for what only a single pass gives."""
-    tolerance = options.tolerance
-    if tolerance is None:
+    if (tolerance := options.tolerance) is None:
         return
     if not isinstance(tolerance, (numbers.Real, torch.Tensor)) or isinstance(tolerance, bool):
         raise InputError(f"options.tolerance: expected a number or a tensor [H, W], got {type(tolerance).__name__}.")
@@ -192,8 +191,7 @@ def check_tensor(name: str, tensor, shape: tuple[int | str, ...], device: torch.
 
 def check_background(background, device: torch.device) -> torch.Tensor:
     """The background as a tensor [3] on ``device``. Raises InputError if it is not three finite numbers there."""
-    given = isinstance(background, torch.Tensor)
-    if not given:
+    if not (given := isinstance(background, torch.Tensor)):
         try:
             background = torch.tensor([float(value) for value in background], dtype=torch.float32, device="cpu")
         except (TypeError, ValueError, OverflowError):

@@ -83,8 +83,7 @@ class Worlds:
         self.driver = driver_of(gaussians[0].device)
         self.camera = replace(camera, height=camera.height * len(counts))  # of pictures below each other
         with checks.explained(options, gaussians[0], [self.camera]):
-            checked = checks.check_gaussians(*gaussians)
-            if sum(counts) != len(checked.means):
+            if sum(counts) != len((checked := checks.check_gaussians(*gaussians)).means):
                 raise InputError(f"counts: expected {len(checked.means)} Gaussians in all, got {sum(counts)}.")
             self.splats = project(checked, camera, options)
             self.bins = self.driver.bin(self.splats, camera, options, worlds=counts)

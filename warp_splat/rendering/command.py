@@ -4,8 +4,9 @@ With ``--bound``, how wrong each pixel of a view may be, too: colors on a logari
 """
 
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -103,8 +104,7 @@ def render_model(config: RenderConfig) -> int:
     given = scene = None
     if _needs_scene(config):
         given = finished.load_scene(config.source_path, say)
-        scene = finished.refined(given)
-        if scene is not given:
+        if (scene := finished.refined(given)) is not given:
             say("The cameras are those of the model, which were refined with it.")
     options = replace(finished.options, of=config.of, tolerance=config.tolerance or None)
     say(f"{len(model)} Gaussians from {config.model_path}, iteration {iteration}")
@@ -115,6 +115,8 @@ def render_model(config: RenderConfig) -> int:
             "bound": lambda camera: draw(camera).bound,
             "popping": lambda camera: popping_of(activated, camera, options),
         }
+        before = ["in linear light"] * finished.is_linear(scene) + ["before exposures"] * bool(finished.exposures)
+        certify = partial(_certify, config, maps, f" ({', '.join(before)})" if before else "")
         if config.orbit or config.video:
             _film(picture, _cameras(config, scene), output, config)
         elif scene:
@@ -125,7 +127,7 @@ def render_model(config: RenderConfig) -> int:
                 for _ in write_views(picture, scene.train, written):
                     pass
                 print(f"  train  {len(scene.train)} views in {written}")
-                _certify(config, maps, scene.train, written)
+                certify(scene.train, written)
             if scene.test and not config.skip_test:
                 extra = {"split": "test", "gaussians": len(model)}
                 where = None
@@ -134,20 +136,20 @@ def render_model(config: RenderConfig) -> int:
                 means, compared = evaluate_views(picture, scene.test, folder, "test", iteration, extra, metrics, where)
                 show_views(compared, folder, "test", iteration, say)
                 print(f"  test   {len(scene.test)} views in {folder / 'test' / f'ours_{iteration}'}")
-                _certify(config, maps, scene.test, folder / "test" / f"ours_{iteration}")
+                certify(scene.test, folder / "test" / f"ours_{iteration}")
                 print(f"  {metrics_line(means)}: {folder / 'results.json'}, pictures in {folder / 'contact_sheet.png'}")
     return 0
 
 
-def _certify(config: RenderConfig, maps: dict[str, Callable[[Camera], torch.Tensor]], views: list[View], folder: Path):
-    """Write how wrong pixels may be, and how much another order may change them, if asked for."""
+def _certify(config: RenderConfig, maps: Mapping[str, Callable], before: str, views: list[View], folder: Path):
+    """Write how wrong pixels may be, and how much another order may change them, if asked for; ``before`` what else."""
     what = {"ideal": "what its Gaussians say", "trained": "what was trained"}[config.of]
     sentences = {
         "bound": f"no pixel is farther from {what} than",
         "popping": "another order of Gaussians that overlap in depth changes no pixel by more than",
     }
     for name, find in maps.items() if config.bound else ():
-        print(f"  {sentences[name]} {upward(write_maps(name, find, views, folder))}: {folder / name}")
+        print(f"  {sentences[name]} {upward(write_maps(name, find, views, folder))}{before}: {folder / name}")
 
 
 def _check(config: RenderConfig) -> None:

@@ -6,6 +6,7 @@ import warp as wp
 from warp_splat.camera import Camera
 from warp_splat.config import TILE, RasterOptions
 from warp_splat.raster.beside import rotations
+from warp_splat.raster.certificate import drawing
 from warp_splat.raster.data import Gaussians
 from warp_splat.raster.drivers import driver_of
 from warp_splat.raster.project import project
@@ -21,7 +22,7 @@ def popping_of(gaussians: Gaussians, camera: Camera, options: RasterOptions) -> 
     Two overlap whose depths are less apart than their standard deviations along the axis of the camera together. No
     pixel stops early here. Exchanging neighbors i and j changes T alpha_i alpha_j |c_i - c_j| (docs/tolerance.md).
     """
-    driver = driver_of(gaussians.means.device)
+    driver, options = driver_of(gaussians.means.device), drawing(options)
     splats = project(gaussians, camera, options, driver)
     crossing = find_crossing(splats, camera)
     drawn = around(splats, camera, crossing)

@@ -202,7 +202,7 @@ def make_blend(variant: BlendVariant) -> wp.Kernel:
         if wp.static(variant.floor):
             may = unsure(raw, bound)
             s[TOTAL + block] = s[TOTAL + block] + may
-            may = times(may, brightness(splat.color, bound.usual))
+            may = times(may, brightness(splat.color, bound.shade, bound.usual))
             left = wp.max(s[IDEAL_T + block], -s[IDEAL_T + block])
             s[ADDED + block] = own_light(left, may, bound.usual, s[ADDED + block])
         if wp.static(variant.ideal):

@@ -96,7 +96,8 @@ def make_ideal(variant: BlendVariant) -> tuple[wp.Function, wp.Function]:
         if wp.static(variant.floor):
             may = bounds.unsure(raw, bound)
             m[TOTAL, p] += may
-            m[ADDED, p] = bounds.own_light(t, may * bounds.brightness(color, bound.usual), bound.usual, m[ADDED, p])
+            may *= bounds.brightness(color, bound.shade, bound.usual)
+            m[ADDED, p] = bounds.own_light(t, may, bound.usual, m[ADDED, p])
         return m
 
     return of_picture, blend_ideal
