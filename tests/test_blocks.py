@@ -12,7 +12,7 @@ from scene_files import LENS, texture, write_image
 from warp_splat.camera import Camera
 from warp_splat.cli import main
 from warp_splat.formats.checkpoint import LAST
-from warp_splat.formats.exchange import load_gaussians
+from warp_splat.formats.exchange import load_gaussians, save_gaussians
 from warp_splat.formats.model_folder import ply_path
 from warp_splat.formats.ply import save_points
 from warp_splat.scene import load_scene
@@ -65,6 +65,11 @@ def test_a_block_has_what_shows_it(two_things):
 @pytest.mark.parametrize("block", ["0/2", "3/2", "2", "a/b", "1/2/3", "-1/2", "/2", "1/1000", "2/100"])
 def test_a_block_that_cannot_be_is_refused(two_things, block):
     refusal(lambda: load_scene(two_things[0], block=block), match=f"--block {block}: expected")
+
+
+def test_a_block_that_no_photograph_shows_is_found_before_another_trains():
+    for number in (1, 2, 24):
+        refusal(lambda: load_scene(SCENE, block=f"{number}/24", report=str), "found none of block 1; take fewer")  # noqa: B023
 
 
 @pytest.fixture(scope="module")
@@ -153,6 +158,14 @@ def test_all_blocks_by_one_command_are_those_of_many(trained, tmp_path, capsys, 
         assert place(one).read_bytes() == place(other).read_bytes()
     after, before = (load_gaussians(path).splats.means for path in (place("together"), ply_path(tmp_path, 60)))
     assert len(after) == len(before)  # nothing grows
+    first = load_gaussians(ply_path(tmp_path / "1", 60))
+    moved = first.splats._replace(means=0.99 * first.splats.means)
+    save_gaussians(ply_path(tmp_path / "1", 60), first._replace(splats=moved))
+    shutil.rmtree(tmp_path / "alone")
+    again = "train", "-s", SCENE, "-m", tmp_path, *SHORT, *all_of_it
+    assert "together: expected a training of these blocks as they are now" in fails(*again)
+    assert (tmp_path / "together").rename(tmp_path.parent / "before") and train(tmp_path, *all_of_it) == 0
+    assert place("together").read_bytes() != place("after").read_bytes()
 
 
 def test_what_a_block_cannot_have(trained, tmp_path, fails, monkeypatch):

@@ -6,6 +6,7 @@ import shutil
 import numpy as np
 import pycolmap
 import pytest
+from commands import SHORT
 from PIL import Image
 from splat_files import some_file
 
@@ -90,6 +91,15 @@ def test_axes_that_may_be_exchanged_are_told(tmp_path, looks):
         source, told = write_positions(tmp_path / "a.csv", world + UTM), []
         found = georeference(model_of(centers, random, looks == "down"), tmp_path, source, 0, told.append)
         assert ("are x and y exchanged?" in told[0]) == ("exchanged" in found["reference"]) == doubted
+
+
+def test_three_positions_say_that_they_always_fit(tmp_path):
+    random, told = np.random.default_rng(3), []
+    centers = random.uniform(-20, 20, (COUNT, 3)) * (1, 1, 0.1)
+    for count in (3, 4):
+        source = write_positions(tmp_path / "a.csv", (centers + UTM)[:count])
+        georeference(model_of(centers, random), tmp_path, source, 0, told.append)
+    assert ["three always fit" in line for line in told] == [True, False]
 
 
 def test_positions_at_one_place_are_refused(tmp_path):
@@ -199,6 +209,28 @@ def test_a_scene_with_coordinates_is_upright_and_says_where(tmp_path):
     for words in ("UTM, origin at 691000.25, 5335000.5, 520", "the worst, a, within 0.5 m", "left out: c"):
         assert words in finding.text
     assert finding.level == "warning"
+
+
+def test_gaussians_from_another_origin_are_refused(tmp_path, fails):
+    """Those of a file, of a model folder, and of a training that goes on: the scene was placed anew since."""
+    scene, here, there = tmp_path / "scene", {"origin": [1.0, 2.0, 3.0]}, {"origin": [9.0, 2.0, 1.0]}
+    shutil.copytree(embedded_scene(), scene)
+    write_coordinates(scene, here)
+    model = tmp_path / "model"
+    assert main(["train", "-s", str(scene), "-m", str(model), *SHORT, "--iterations", "1"]) == 0
+    for name, where in (("same", here), ("other", there), ("unknown", None)):
+        save_gaussians(tmp_path / f"{name}.ply", some_file(9)._replace(coordinates=where))
+        if name != "other":
+            load_scene(scene, start=str(tmp_path / f"{name}.ply"), report=str)
+            assert main(["render", "-m", str(tmp_path / f"{name}.ply"), "-s", str(scene), "--quiet"]) == 0
+    said = "expected Gaussians from the origin [1.0, 2.0, 3.0]"
+    assert said in fails("render", "-m", tmp_path / "other.ply", "-s", scene)
+    assert said in fails("train", "-s", scene, "-m", tmp_path / "new", "--start_ply", tmp_path / "other.ply")
+    write_coordinates(scene, there)
+    said = "expected Gaussians from the origin [9.0, 2.0, 1.0]"
+    assert said in fails("render", "-m", model) and said in fails("train", "--resume", model, "--iterations", "2")
+    assert said in fails("train", "-s", scene, "-m", tmp_path / "new", "--start_ply", model)
+    assert read_coordinates(model) == here
 
 
 def test_damaged_coordinates_get_one_sentence(tmp_path):

@@ -213,6 +213,9 @@ def test_cameras_at_one_place_or_far_away(tmp_path, capsys, far, apart, words):
 
     findings, _ = examine(write_transforms(tmp_path / "a", frame=frame, points=False), tmp_path, capsys, 0)
     assert any(level == "warning" and words in text for level, _, text in findings), findings
+    lines: list[str] = []
+    load_scene(tmp_path / "a", report=lines.append)
+    assert any(words in line for line in lines) == bool(far)
 
 
 def test_a_scene_so_small_that_little_of_it_is_drawn(life, tmp_path, capsys, monkeypatch):

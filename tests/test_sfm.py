@@ -26,7 +26,7 @@ from warp_splat.config import SfmConfig
 from warp_splat.formats.png import save_video
 from warp_splat.scene import load_scene
 from warp_splat.sfm import matching, stages
-from warp_splat.sfm.command import scene_for, sfm
+from warp_splat.sfm.command import _claim, scene_for, sfm
 from warp_splat.sfm.video import sample_frames
 
 COUNT = 6
@@ -244,6 +244,20 @@ def test_a_folder_in_use_stays_as_it_is(photos, scene, tmp_path):
         config = SfmConfig(str(tmp_path / source), str(tmp_path / target))
         refusal(partial(sfm, config), *words)
     refusal(lambda: parse(["sfm", str(photos[0]), str(tmp_path / "x"), "--frames", "2"]), "--frames")
+
+
+def test_photographs_of_one_size_that_were_exchanged_are_others(tmp_path):
+    """Uncompressed ones; a folder of before, which has no marks, goes by sizes."""
+    config, files = SfmConfig(str(tmp_path / "a"), str(tmp_path / "b")), [tmp_path / "a" / f"{k}.tif" for k in (0, 1)]
+    for file, image in zip(files, (texture(), 255 - texture()), strict=True):
+        write_image(file, image)
+    assert len({file.stat().st_size for file in files}) == 1
+    work = _claim(tmp_path / "a", tmp_path / "b", config)
+    assert _claim(tmp_path / "a", tmp_path / "b", config) == work
+    files[0].rename(tmp_path / "c"), files[1].rename(files[0]), (tmp_path / "c").rename(files[1])
+    refusal(lambda: _claim(tmp_path / "a", tmp_path / "b", config), "begun with others")
+    (work / "marks.json").unlink()
+    assert _claim(tmp_path / "a", tmp_path / "b", config) == work
 
 
 def test_a_damaged_database_gets_one_sentence(photos, scene, tmp_path):

@@ -117,8 +117,7 @@ def parse(arguments: list[str]) -> Any:
     if values.get("config"):
         from warp_splat.training.config_file import read_config  # noqa: PLC0415 - seldom needed
 
-        file = read_config(values["config"])
-        if file.get("minutes"):
+        if (file := read_config(values["config"])).get("minutes"):
             _check_minutes(file)
         values = _over(file, values)
     if values.get("start_checkpoint"):

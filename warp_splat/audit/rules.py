@@ -101,8 +101,7 @@ def find_extent(prober: Prober) -> str:
     """Where a strong Gaussian ends although its alpha is not faint yet."""
     alpha = prober.alpha(6.0, 0.95)
     deviations = np.sqrt(-2 * np.log(alpha / 0.95).clip(max=0))
-    drawn = prober.cover([CENTER], 3.0, 6.0, 0.95) > 0.3 * alpha
-    if not drawn.any():
+    if not (drawn := prober.cover([CENTER], 3.0, 6.0, 0.95) > 0.3 * alpha).any():
         return "A Gaussian of 6 px is not drawn."
     missing = ~drawn & (alpha > 1.1 * max(prober.options.get("alpha_min", 0), 1.5 * prober.seen, 1e-6))
     if not missing.any():

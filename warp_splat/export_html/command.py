@@ -38,8 +38,7 @@ def export_html(config: ExportHtmlConfig) -> int:
     Raises:
         InputError: if the model cannot be read, is too large for browsers, or the page cannot be written.
     """
-    path = Path(config.page)
-    if path.suffix.lower() not in (".html", ".htm"):
+    if (path := Path(config.page)).suffix.lower() not in (".html", ".htm"):
         raise InputError(f"{path}: expected the name of a page, which ends in .html; found {path.suffix!r}.")
     iteration, (splats, *_), trained = model_folder.open_model(config.model, crop=config.crop)
     cameras = model_folder.read_cameras(model_folder.folder_of(config.model))
@@ -96,8 +95,7 @@ def make_page(name: str, splats: SplatArrays, cameras: list[tuple[str, Camera]],
     if count > pack.CHUNK:
         splats, coarse, starts = merged(splats, pack.CHUNK, [camera for _, camera in cameras])
     parts = {id: base64.b64encode(data).decode() for id, data in pack.parts(splats, origin, coarse).items()}
-    size = sum(map(len, parts.values()))
-    if size > LONGEST:
+    if (size := sum(map(len, parts.values()))) > LONGEST:
         raise InputError(
             f"{name}: {count} Gaussians make a page of {size / 1e6:.0f} MB, expected at most "
             f"{LONGEST / 1e6:.0f} MB, which browsers can read; use --max_gaussians."

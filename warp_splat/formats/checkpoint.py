@@ -118,8 +118,7 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
         (text, facts), content, arrays = _facts(file), np.memmap(path, np.uint8, "r"), {}
         end = 8 + int.from_bytes(content[:8], "little")  # of the header; without gaps, arrays follow
         for name in file.offset_keys():
-            kept = file.get_slice(name)
-            if kept.get_dtype() not in DTYPES:
+            if (kept := file.get_slice(name)).get_dtype() not in DTYPES:
                 raise Unexpected(f"an array of {kept.get_dtype()}")
             found = np.ndarray(kept.get_shape(), DTYPES[kept.get_dtype()], content, end)
             arrays[name], end = found if OF_GAUSSIANS.fullmatch(name) else found.copy(), end + found.nbytes
@@ -145,8 +144,7 @@ def find_checkpoint(path: str | Path) -> Path:
     Raises:
         InputError: if there is none, or it is a file of torch's pickles.
     """
-    path = Path(path)
-    if path.is_dir():
+    if (path := Path(path)).is_dir():
         others = sorted(other for other in path.glob("*.safetensors") if other.is_file())
         path /= LAST
         if not path.is_file() and others:
@@ -176,8 +174,7 @@ def remove_leftovers(folder: str | Path) -> None:
 
 def _facts(file: Any) -> tuple[str, dict[str, Any]]:
     """The JSON text and its values."""
-    text = (file.metadata() or {}).get("warp_splat")
-    if text is None:
+    if (text := (file.metadata() or {}).get("warp_splat")) is None:
         raise Unexpected("other safetensors")
     facts = json.loads(text)
     found = facts.get("format") if isinstance(facts, dict) else None

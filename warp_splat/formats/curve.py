@@ -23,8 +23,7 @@ def along_curve(means: torch.Tensor) -> torch.Tensor:
 def keys_of(means: torch.Tensor, rows: Rows = ALONE) -> torch.Tensor:
     """The places of points [N, 3] on that curve, [N] int64; ``rows``: of which they are a part."""
     values = torch.nan_to_num(means.detach())
-    count = rows.total(len(values))
-    if not count:
+    if not (count := rows.total(len(values))):
         return torch.empty(0, dtype=torch.int64, device=means.device)
     low, high = rows.between(values, count // 100)  # what lies far out shall not set the size of the cells
     shares = torch.nan_to_num((values - low) / (high - low).amax().clamp_min(1e-30)).clamp(0.0, 1.0)

@@ -184,16 +184,14 @@ def json_object(text: bytes) -> dict:
     def refuse(name: str):
         raise ValueError(f"the JSON holds {name}")
 
-    parsed = json.loads(text.decode("utf-8"), parse_constant=refuse)
-    if not isinstance(parsed, dict):
+    if not isinstance((parsed := json.loads(text.decode("utf-8"), parse_constant=refuse)), dict):
         raise Unexpected("JSON that is no object")
     return parsed
 
 
 def entries_of(entry: dict, key: str) -> list:
     """The list that an object holds under ``key``, empty if it has none."""
-    found = entry.get(key, [])
-    if not isinstance(found, list):
+    if not isinstance((found := entry.get(key, [])), list):
         raise Unexpected(f"{key} that are no list")
     return found
 
@@ -203,8 +201,7 @@ def numbers_of(entry: dict, key: str, count: int) -> np.ndarray:
     values = entries_of(entry, key)
     if len(values) != count or not all(isinstance(value, int | float) for value in values):
         raise Unexpected(f"{key} that are not {count} numbers")
-    array = np.array([float(value) for value in values])
-    if not np.isfinite(array).all():
+    if not np.isfinite(array := np.array([float(value) for value in values])).all():
         raise ValueError(f"{key} that are not finite")
     return array
 

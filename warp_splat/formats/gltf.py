@@ -27,6 +27,7 @@ AXES = "LUF"
 UNDERSTOOD = {NAME, "KHR_mesh_quantization"}  # extensions that a file may require
 COLOR_SPACES = ("srgb_rec709_display", "lin_rec709_display")  # as photographs have it; in linear light
 RENDER_MODE = "SplatRenderMode"
+INSTANCES = "EXT_mesh_gpu_instancing"
 SOME_MIP = "only some of its parts are antialiased; all are drawn as if none were"
 COORDINATES = "coordinates"
 MOST_PIECES = 4096  # meshes; the Gaussians of a scene are one or a few
@@ -95,13 +96,15 @@ def load_gltf(path: str | Path, report: Report = print) -> SplatFile:
             room -= len(splats.means)
             if room < 0:
                 raise Unexpected("more Gaussians than its data has room for, some placed many times")
-            turn, translation, scale = decompose(world)
+            turn, translation, scale = decompose(world, notes.append)
             parts.append(turned(splats, frame(AXES) @ turn, frame(AXES) @ translation, scale))
         told = [piece["extensions"][NAME] for piece, _ in placed]
         linear = {extension.get("colorSpace") == COLOR_SPACES[1] for extension in told}
         if len(linear) > 1:
             raise Unexpected("meshes of which some are in linear light and some are not; export them alike")
         mip = [_extra(extension, RENDER_MODE) == "mip" for extension in told]
+        if INSTANCES in entries_of(document.json, "extensionsUsed"):
+            notes.append(f"{INSTANCES} repeats nothing here; export nodes instead to draw all")
         notes += [SOME_MIP] * (any(mip) and not all(mip))
     for note in dict.fromkeys(notes):
         report(f"{path}: {note}.")

@@ -53,15 +53,13 @@ class Document:
             else:
                 text = source.read()
         self.json = json_object(text)
-        count = len(entries_of(self.json, "buffers"))
-        if count > MOST_BUFFERS:
+        if (count := len(entries_of(self.json, "buffers"))) > MOST_BUFFERS:
             raise Unexpected(f"{count} buffers, more than {MOST_BUFFERS}")
         self.buffers = [self._open(self.entry("buffers", i), chunk if i == 0 else None) for i in range(count)]
 
     def entry(self, kind: str, index: Any) -> dict:
         """The object ``index`` of the list ``kind`` of the JSON."""
-        entries = self.json.get(kind)
-        if not isinstance(entries, list):
+        if not isinstance((entries := self.json.get(kind)), list):
             raise Unexpected(f"no list of {kind}")
         found = entries[whole_number(index, f"index of {kind}", len(entries) - 1)]
         if not isinstance(found, dict):
@@ -83,8 +81,7 @@ class Document:
         length = whole_number(view.get("byteLength"), "byteLength of a bufferView", buffer.length - first)
         offset = whole_number(accessor.get("byteOffset", 0), "byteOffset of an accessor", length)
         element = dtype.itemsize * width
-        stride = whole_number(view.get("byteStride", element), "byteStride", 252)
-        if stride < element:
+        if (stride := whole_number(view.get("byteStride", element), "byteStride", 252)) < element:
             raise ValueError(f"byteStride {stride} for elements of {element} bytes")
         count = whole_number(accessor.get("count"), "count", (length - offset - element) // stride + 1)
         size = max(0, (count - 1) * stride + element)
@@ -109,8 +106,9 @@ class Document:
             if index in seen:
                 raise Unexpected(f"node {index} in two places")
             seen.add(index)
-            world = parent @ _matrix(node)
-            if not np.isfinite(world).all():
+            if (node.get("extensions") or {}).get("KHR_node_visibility") == {"visible": False}:
+                continue
+            if not np.isfinite(world := parent @ _matrix(node)).all():
                 raise ValueError(f"node {index} has a transform that is not finite")
             if "mesh" in node:
                 found.append((self.entry("meshes", node["mesh"]), world))
@@ -122,8 +120,7 @@ class Document:
             if chunk is None:
                 raise Unexpected("a buffer without data")
             return chunk._replace(length=whole_number(entry.get("byteLength"), "byteLength of a buffer", chunk.length))
-        uri = entry["uri"]
-        if not isinstance(uri, str) or uri.startswith("data:"):
+        if not isinstance((uri := entry["uri"]), str) or uri.startswith("data:"):
             raise Unexpected("a buffer inside the JSON; export it as .glb, or with a .bin file")
         folder = self.path.parent.resolve()
         path = (folder / unquote(uri)).resolve()  # a null byte raises ValueError, as it should
@@ -152,8 +149,7 @@ class Document:
                 raise ValueError(f"a chunk of {chunk_length} bytes, of which {length - place} are there")
             chunks[kind] = Buffer(self.path, place, chunk_length)
             place += chunk_length
-        text = chunks.get(b"JSON")
-        if text is None or text.length > JSON_BYTES:
+        if (text := chunks.get(b"JSON")) is None or text.length > JSON_BYTES:
             raise Unexpected("no JSON" if text is None else f"JSON of {text.length} bytes, more than {JSON_BYTES}")
         source.seek(text.start)
         return source.read(text.length), chunks.get(b"BIN\0")
@@ -166,8 +162,7 @@ def _matrix(node: dict) -> np.ndarray:
     from scipy.spatial.transform import Rotation  # noqa: PLC0415 - slow to load, and other formats do without
 
     node = {"translation": [0, 0, 0], "rotation": [0, 0, 0, 1], "scale": [1, 1, 1], **node}
-    quat = numbers_of(node, "rotation", 4)
-    if not 1e-6 < np.linalg.norm(quat) < 1e6:
+    if not 1e-6 < np.linalg.norm(quat := numbers_of(node, "rotation", 4)) < 1e6:
         raise ValueError(f"a rotation {quat.tolist()}")
     matrix = np.eye(4)
     matrix[:3, :3] = Rotation.from_quat(quat).as_matrix() * numbers_of(node, "scale", 3)

@@ -286,8 +286,7 @@ def read_environment(path: str | Path, iteration: int) -> np.ndarray | None:
     """
 
     def parse(facts: dict) -> np.ndarray:
-        harmonics = np.array(facts["harmonics"], np.float32)
-        if harmonics.shape != (16, 3) or not np.isfinite(harmonics).all():
+        if (harmonics := np.array(facts["harmonics"], np.float32)).shape != (16, 3) or not np.isfinite(harmonics).all():
             raise Unexpected(f"numbers of shape {list(harmonics.shape)}, or such that are not finite")
         return harmonics
 

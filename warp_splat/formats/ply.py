@@ -106,8 +106,7 @@ def load_points(path: str | Path, report: Report = print) -> tuple[np.ndarray, n
             unit = [255 if vertex.dtype[name].kind == "f" else 1 for name in COLOR]
             values = np.stack([vertex[name] * np.float64(u) for name, u in zip(COLOR, unit, strict=True)], axis=1)
             colors = np.nan_to_num(values).clip(0, 255).round().astype(np.uint8)
-    finite = np.isfinite(points).all(axis=1)
-    if not finite.all():
+    if not (finite := np.isfinite(points).all(axis=1)).all():
         report(f"{path}: left out {np.count_nonzero(~finite)} of {len(points)} points that are not finite.")
     return points[finite], colors[finite]
 
@@ -134,8 +133,7 @@ def load_ply(path: str | Path, report: Report = print) -> SplatFile:
             return SplatFile(finite_rows(read_compressed(tables), path, report), *told)
         vertex = tables.rows("vertex")
         names = vertex.dtype.names or ()
-        rest_count = sum(name.startswith("f_rest_") for name in names)
-        if rest_count not in REST_COUNTS:
+        if (rest_count := sum(name.startswith("f_rest_") for name in names)) not in REST_COUNTS:
             raise InputError(
                 f"{path}: expected 0, 9, 24 or 45 properties f_rest_* (SH degree 0 to 3), found {rest_count}; "
                 "export the Gaussians with a degree of at most 3."

@@ -134,8 +134,7 @@ class _Bundle:
         return SplatFile(splats, self.meta.get("antialias") is True or self.meta.get("model") == "antialiased")
 
     def _part(self, name: str) -> dict:
-        part = self.meta.get(name)
-        if not isinstance(part, dict):
+        if not isinstance((part := self.meta.get(name)), dict):
             raise files.Unexpected(f"no object {name!r} in its {META}")
         return part
 

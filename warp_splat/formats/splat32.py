@@ -50,8 +50,7 @@ def load_splat(path: str | Path, report: Report = print) -> SplatFile:
         InputError: if the file is missing or not a whole number of rows.
     """
     with reading(path, "a .splat file, 32 bytes for each Gaussian"), open(path, "rb") as source:
-        size = os.fstat(source.fileno()).st_size
-        if size == 0 or size % ROW.itemsize:
+        if (size := os.fstat(source.fileno()).st_size) == 0 or size % ROW.itemsize:
             raise Unexpected(f"{size} bytes; it may be cut short")
         rows = np.fromfile(source, ROW, size // ROW.itemsize)
     splats = SplatArrays(

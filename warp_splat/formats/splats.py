@@ -49,8 +49,7 @@ def check_shapes(splats: SplatArrays) -> None:
     count = len(splats.means)
     shapes = {"means": (count, 3), "opacities": (count,), "scales": (count, 3), "quats": (count, 4)}
     for name, shape in shapes.items():
-        found = getattr(splats, name).shape
-        if found != shape:
+        if (found := getattr(splats, name).shape) != shape:
             raise InputError(f"{name}: expected shape {shape}, got {found}.")
     if splats.sh.shape not in [(count, coefficients, 3) for coefficients in COEFFICIENTS]:
         raise InputError(f"sh: expected shape ({count}, 1|4|9|16, 3), got {splats.sh.shape}.")
@@ -83,8 +82,7 @@ def cropped(splats: SplatArrays, box: Sequence[float]) -> SplatArrays:
     if len(box) != 6 or not np.less(box[:3], box[3:]).all():
         found = " ".join(f"{value:g}" for value in box)
         raise InputError(f"--crop: expected six numbers, the smallest x, y and z, then the largest; got {found}.")
-    inside = ((splats.means >= box[:3]) & (splats.means <= box[3:])).all(1)
-    if not inside.any():
+    if not (inside := ((splats.means >= box[:3]) & (splats.means <= box[3:])).all(1)).any():
         around = " ".join(f"{value:.3g}" for value in (*splats.means.min(0), *splats.means.max(0)))
         raise InputError(f"--crop: expected a box with Gaussians in it, found none; all of them lie in {around}.")
     return splats.take(inside)
@@ -135,8 +133,10 @@ def turned(
         )
 
 
-def decompose(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+def decompose(matrix: np.ndarray, report: Report) -> tuple[np.ndarray, np.ndarray, float]:
     """Rotation [3, 3], translation [3] and scale of a transform [4, 4]; a mirror is part of the rotation.
+
+    ``report`` is told of a place so far away that float32 rounds it by more than a thousandth.
 
     Raises:
         Unexpected: if it stretches or shears, which would need other Gaussians.
@@ -146,6 +146,8 @@ def decompose(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
     turn = linear / scale if 0 < scale < math.inf else np.zeros((3, 3))
     if not np.allclose(turn.T @ turn, np.eye(3), atol=EVEN):
         raise Unexpected("a node that stretches or shears; apply its transform to the Gaussians before the export")
+    if (step := np.spacing(np.float32(np.abs(matrix[:3, 3]).max()))) > 1e-3:
+        report(f"so far from the origin, positions are rounded to steps of {step:.2g}; move it nearer")
     u, _, v = np.linalg.svd(turn)
     return u @ v, matrix[:3, 3], scale
 

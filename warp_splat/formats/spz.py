@@ -161,8 +161,7 @@ def _sizes(version: int, count: int, degree: int, file_bytes: int) -> list[int]:
 
 def _read_gzip(source: BinaryIO, file_bytes: int) -> Packed:
     with gzip.GzipFile(fileobj=source) as stream:
-        start = stream.read(HEADER.size)
-        if len(start) < HEADER.size or start[:4] != MAGIC:
+        if len(start := stream.read(HEADER.size)) < HEADER.size or start[:4] != MAGIC:
             raise Unexpected("a gzip file of something else")
         _, version, count, degree, *_ = header = HEADER.unpack(start)
         if version not in (2, 3):
@@ -201,8 +200,7 @@ def _read_zstd(source: BinaryIO, file_bytes: int) -> Packed:
 
 
 def _exactly(source, size: int) -> bytes:
-    data = source.read(size)
-    if len(data) < size:
+    if len(data := source.read(size)) < size:
         raise ValueError(f"found {len(data)} of {size} bytes")
     return data
 

@@ -53,8 +53,7 @@ def from_smallest_three(largest: np.ndarray, others: np.ndarray) -> np.ndarray:
 
 def clipped(what: str, values: np.ndarray, low: float, high: float, report: Report) -> np.ndarray:
     """``values`` [N, ...] moved into a format's range; ``report`` is told of how many Gaussians if there are any."""
-    outside = (values < low) | (values > high)
-    if outside.any():
+    if (outside := (values < low) | (values > high)).any():
         rows = np.count_nonzero(outside.any(axis=tuple(range(1, values.ndim))))
         report(f"{what} of {rows} of {len(values)} Gaussians moved into {low:.4g}..{high:.4g}")
     return np.clip(values, low, high)

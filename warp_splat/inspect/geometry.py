@@ -115,8 +115,7 @@ def check_exposure(subject: Subject) -> Iterator[Finding]:
             places = np.array([point.xy for point in seen]) / (image.camera.width, image.camera.height)
             ids = np.array([point.point3D_id for point in seen], np.int64)
             samples[image.name] = brightness.take_sample(subject.thumbnails[image.name], ids, places)
-    gains = brightness.fit_gains(samples)
-    if not gains.stops:
+    if not (gains := brightness.fit_gains(samples)).stops:
         yield Finding("exposure", "note", "photographs share too few points to compare how bright they are.")
         return
     subject.stops = {name: float(gains.stops[name][brightness.GREEN]) for name in sorted(gains.stops)}

@@ -10,14 +10,13 @@ import numpy as np
 from warp_splat.errors import InputError
 from warp_splat.formats.coordinates import read_coordinates
 from warp_splat.inspect.subject import Finding, Subject
-from warp_splat.scene import MASKS, read_photos, require_one_kind, require_unmasked, require_visible, too_near
+from warp_splat.scene import MASKS, read_photos, require_one_kind, require_unmasked, require_visible, too_far, too_near
 from warp_splat.scene.photos import READABLE, find_files
 from warp_splat.text import few
 
 FIELDS_OF_VIEW = 15.0, 120.0  # degrees; lenses outside of it are rare, and wrong focal lengths land there
 ASPECT = 1.2  # fx / fy of a real camera is nearly 1
 OFF_CENTER = 0.1  # of the image's width or height
-ROUNDED = 1e-4  # of the distance between cameras, which may be lost by rounding
 AT_LEAST = 20  # images; fewer train, but show little from new sides
 
 
@@ -54,9 +53,8 @@ def check_cameras(subject: Subject) -> Iterator[Finding]:
         away, spread = np.abs(centers).max(), np.ptp(centers, axis=0).max()
         if spread <= 1e-9 * away and not len(subject.points):
             yield Finding("coverage", "warning", "all cameras stand at one place, from where depth cannot be seen.")
-        elif ROUNDED * spread < 2.0**-24 * away:
-            text = f"cameras are {away:.3g} from the origin and {spread:.3g} apart, too little for 32 bits"
-            yield Finding("coordinates", "warning", f"{text}: move the origin, as warp-splat sfm --coordinates does.")
+        elif far := too_far(subject.photos):
+            yield Finding("coordinates", "warning", far)
 
 
 def check_coordinates(subject: Subject) -> Iterator[Finding]:

@@ -43,8 +43,7 @@ def mesh(config: MeshConfig) -> int:
     Raises:
         InputError: if the model, its scene, an option or a needed package is not usable; if there is no surface.
     """
-    output = Path(config.output)
-    if output.suffix.lower() not in ENDINGS:
+    if (output := Path(config.output)).suffix.lower() not in ENDINGS:
         raise InputError(f"{output}: expected a name that ends in {', '.join(ENDINGS)}; rename it.")
     check_output(output)
     pieces_place = output.with_name(f"{output.stem}_collision{output.suffix}")
@@ -62,8 +61,7 @@ def mesh(config: MeshConfig) -> int:
     if config.voxel and any(view.depth.any() for view in views):
         _grid(config, PIXELS * pixel(views), views, memory / 2)  # refused now, not after minutes
     views = filled(drawn, views, opened.scene.train)
-    natural = PIXELS * pixel(views)
-    if math.isnan(natural):
+    if math.isnan(natural := PIXELS * pixel(views)):
         expected = f"expected two or more views that agree on depths, found none of {len(views)}"
         raise InputError(f"{config.model}: {expected}; train on more photographs, or longer.")
     voxel, voxels = _grid(config, natural, views, memory / 2)

@@ -88,8 +88,7 @@ class SensorSplatCamera:
         for shape, source in enumerate(model.shape_source):
             if not hasattr(source, "sh_coeffs"):
                 continue
-            size = float(sizes[shape][0])
-            if not (size > 0 and np.allclose(sizes[shape], size)):
+            if not ((size := float(sizes[shape][0])) > 0 and np.allclose(sizes[shape], size)):
                 raise InputError(f"shape {shape}: expected a scale that is positive and the same along all axes.")
             piece = Piece(shape, int(bodies[shape]), size, source, view(source, size))
             self._pieces[int(worlds[shape])].append(piece)

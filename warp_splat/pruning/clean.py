@@ -34,8 +34,7 @@ def clean(config: CleanConfig) -> int:
     output = output_of(config.model, config.output, "cleaned.ply")
     opened = Opened(config)
     file, before = opened.file, opened.file.splats
-    found = floaters(before, opened.setting, config.views, config.near)
-    if found.all():
+    if (found := floaters(before, opened.setting, config.views, config.near)).all():
         raise InputError(f"{config.model}: nothing would be left; choose lower --views or --near.")
     splats = before.take(np.flatnonzero(~found))
     if config.steps:

@@ -98,15 +98,13 @@ def bytes_of(size: str) -> int:
     Raises:
         InputError: if it is no size.
     """
-    found = re.fullmatch(r"(\d+\.?\d*)\s*([KMG]?)B?", size.strip().upper())
-    if not found or not float(found[1]):
+    if not (found := re.fullmatch(r"(\d+\.?\d*)\s*([KMG]?)B?", size.strip().upper())) or not float(found[1]):
         raise InputError(f"--size {size:.40}: expected a size of file such as 10MB or 500kB.")
     return int(float(found[1]) * UNITS[found[2]])
 
 
 def _check(config: SimplifyConfig) -> None:
-    given = [name for name in ("keep", "max_loss", "size", "tolerance") if getattr(config, name)]
-    if len(given) != 1:
+    if len(given := [name for name in ("keep", "max_loss", "size", "tolerance") if getattr(config, name)]) != 1:
         found = " and ".join(f"--{name}" for name in given) or "none"
         raise InputError(f"simplify: expected one of --keep, --max_loss, --size and --tolerance above 0, got {found}.")
     if config.size:

@@ -109,13 +109,14 @@ class Finished:
             raise InputError(f"{self.path}: it does not say what it was trained on; name the scene with -s.")
         if trained_on and os.path.abspath(source) != os.path.abspath(trained_on):
             say(f"The scene is {source}; the model was trained on {trained_on}.")
-        resolution = trained.get("resolution", -1)
-        if not isinstance(resolution, int):
+        if not isinstance((resolution := trained.get("resolution", -1)), int):
             raise InputError(f"{self.path}: expected a whole number as resolution in cfg_args, found {resolution!r}.")
         flags = {name: bool(trained.get(name)) for name in ("white_background", "eval", "invert_masks")}
         names = {"images": str(trained.get("images", "images")), "lens": str(trained.get("lens", "undistort"))}
         names["block"] = str(trained.get("block", ""))
-        return load_scene(source, **names, resolution=resolution, **flags, memory=photo_memory(), report=say)
+        scene = load_scene(source, **names, resolution=resolution, **flags, memory=photo_memory(), report=say)
+        scene.refuse_other_origin(self.path, self.placed().coordinates)
+        return scene
 
     def refined(self, scene: Scene) -> Scene:
         """The scene with the cameras that were learned with the Gaussians; itself, if they were not.

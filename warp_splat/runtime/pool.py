@@ -177,8 +177,7 @@ def in_slices(run: Callable[[int, int], object], bounds: list[int]) -> None:
         run = torch.inference_mode()(run)
     # each with its function: a helper that sleeps or comes late knows its job, which must not keep tensors alive
     slices = [partial(run, low, high) for low, high in itertools.pairwise(bounds) if high > low]
-    helpers = min(_threads, len(slices)) - 1
-    if helpers <= 0:
+    if (helpers := min(_threads, len(slices)) - 1) <= 0:
         for call in slices:
             call()
         return

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 __all__ = ["Scene", "View", "has_cameras", "load_scene"]
 
 MASKS = "masks"  # the folder beside the images' or, for cameras in JSON, in the scene
+ROUNDED = 1e-4  # of the distance between cameras, which may be lost by rounding
 HOLD_OUT = 8  # every 8th image by name is for testing (graphdeco `llffhold`, after Barron et al. 2022)
 
 
@@ -88,18 +89,21 @@ def load_scene(
         file, points, colors = load_start(start, report)
     elif drawn:
         points, colors = random_points([photo.camera for photo in train])
-    part = block_of(block, points, [photo.camera for photo in train]) if block else None
-    if part:
+    if part := block_of(block, points, [photo.camera for photo in train]) if block else None:
         counts = len(train), len(points)
-        train, test = ([photo for photo in some if part.shown(photo.camera, points)] for some in (train, test))
-        if not train:
-            raise InputError(f"--block {block}: expected photographs that show it, found none; take fewer blocks.")
+        shown = np.array([part.shown(photo.camera, points) for photo in (*train, *test)])
+        if empty := np.flatnonzero(~shown[: len(train)].any(0)).tolist():  # of any: before others are trained in vain
+            found = f"none of block {empty[0] + 1}"
+            raise InputError(f"--block {block}: expected photographs of each, found {found}; take fewer blocks.")
+        own = shown[:, part.number]
+        train, test = list(compress(train, own)), list(compress(test, own[len(train) :]))
         rows = part.starts([photo.camera for photo in train], points)
         points, colors, file = points[rows], colors[rows], file and file._replace(splats=file.splats.take(rows))
         report(f"Block {block}: {len(train)} of {counts[0]} training images, {len(points)} of {counts[1]} points.")
     require_visible(train, points, start or source)
-    if not drawn and (near := too_near(train, points)):
-        report(f"Warning: {near}")
+    for told in (too_far(train), "" if drawn else too_near(train, points)):
+        if told:
+            report(f"Warning: {told}")
     views, bound = load_views(train + test, resolution, white_background, invert_masks, memory)
     halves = (train, views[: len(train)]), (test, views[len(train) :])
     train_views, test_views = (_drop_masked(*half, invert_masks, source, report) for half in halves)
@@ -155,8 +159,7 @@ def read_photos(
     """
     from warp_splat.scene import colmap, transforms  # noqa: PLC0415  keeps `import warp_splat` light
 
-    source = Path(source)
-    if is_video(source):
+    if is_video(source := Path(source)):
         raise InputError(f"{source}: expected the folder of a scene, found a video; {sfm_hint(source)}")
     if not source.is_dir():
         found = "a file" if source.exists() else "nothing"
@@ -211,6 +214,16 @@ def _hold_out(photos: list[Photo], source: str | Path) -> tuple[list[Photo], lis
             "none to train on; add images or leave out --eval."
         )
     return train, photos[::HOLD_OUT]
+
+
+def too_far(photos: list[Photo]) -> str:
+    """What to tell the user if the cameras are so far from the origin that 32 bits are too few; else nothing."""
+    centers = np.array([photo.camera.center for photo in photos])
+    away, spread = np.abs(centers).max(), np.ptp(centers, axis=0).max()
+    if len(photos) < 2 or ROUNDED * spread >= 2.0**-24 * away or spread <= 1e-9 * away:
+        return ""
+    text = f"cameras are {away:.3g} from the origin and {spread:.3g} apart, too little for 32 bits"
+    return f"{text}: move the origin, as warp-splat sfm --coordinates does."
 
 
 def too_near(photos: list[Photo], points: np.ndarray) -> str:

@@ -37,16 +37,16 @@ class Block(NamedTuple):
 
     def holds(self, points: np.ndarray) -> np.ndarray:
         """Which of ``points`` [P, 3] lie in it, [P] bool."""
-        low, high = self.cells[self.number]
-        return ((low <= points) & (points < high)).all(1)
+        return _within(self.cells[self.number], points)
 
-    def shown(self, camera: Camera, points: np.ndarray) -> bool:
-        """Whether a camera stands in it, or shows much of it, as ``points`` [P, 3] tell: the nearer, the more."""
+    def shown(self, camera: Camera, points: np.ndarray) -> list[bool]:
+        """Of each cell, whether a camera is in it, or shows much of it by ``points`` [P, 3]: the nearer, the more."""
         center = camera.center[None]
         some = points[:: max(1, len(points) // (SOME * len(self.cells)))]
         away = np.linalg.norm(some - center, axis=1)
         seen = visible(camera, some) / np.maximum(away, 0.1 * np.median(away)) ** 2
-        return bool(self.holds(center)[0]) or bool(seen[self.holds(some)].sum() > SHARE * seen.sum())
+        most = SHARE * seen.sum()
+        return [bool(_within(c, center)[0]) or bool(seen[_within(c, some)].sum() > most) for c in self.cells]
 
     def starts(self, cameras: Sequence[Camera], points: np.ndarray) -> np.ndarray:
         """Which of ``points`` [P] it starts from: its own, and at most as many others that the cameras show."""
@@ -55,6 +55,10 @@ class Block(NamedTuple):
             seen |= visible(camera, points)
         others = np.flatnonzero(seen & ~own)
         return np.sort(np.append(np.flatnonzero(own), others[:: -(-len(others) // max(1, own.sum())) or 1]))
+
+
+def _within(cell: np.ndarray, points: np.ndarray) -> np.ndarray:
+    return ((cell[0] <= points) & (points < cell[1])).all(1)
 
 
 def block_of(text: str, points: np.ndarray, cameras: Sequence[Camera]) -> Block:

@@ -181,8 +181,7 @@ def _points(model: pycolmap.Reconstruction, report: Report) -> tuple[np.ndarray,
     with np.errstate(over="ignore"):  # becomes infinite, and is dropped
         points = np.array([point.xyz for point in records], np.float32).reshape(-1, 3)
     colors = np.array([point.color for point in records], np.uint8).reshape(-1, 3)
-    finite = np.isfinite(points).all(axis=1)
-    if not finite.all():
+    if not (finite := np.isfinite(points).all(axis=1)).all():
         report(f"Dropping {np.count_nonzero(~finite)} of {len(points)} points that are not finite.")
     return points[finite], colors[finite]
 

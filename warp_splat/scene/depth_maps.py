@@ -79,8 +79,7 @@ def _read_fits(path: Path, names: list[str], maps: dict[View, Path]) -> list[Fit
 
 
 def _fit(entries: dict, name: str) -> Fit:
-    entry = entries.get(name)
-    if not isinstance(entry, dict):
+    if not isinstance((entry := entries.get(name)), dict):
         raise Unexpected(f"none for {name}")
     values = [entry.get(key) for key in Fit._fields]
     if not all(isinstance(value, int | float) and np.isfinite(float(value)) for value in values):

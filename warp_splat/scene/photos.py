@@ -68,8 +68,7 @@ class ImageFinder:
         Raises:
             InputError: if the name leads out of the folder, or several files have its stem.
         """
-        path = Path(name)
-        if path.is_absolute() or ".." in path.parts:
+        if (path := Path(name)).is_absolute() or ".." in path.parts:
             raise InputError(f"{self.root}: expected names of files in this folder, found {name!r:.200}; rename it.")
         if self.has(path):
             return self.root / path

@@ -6,7 +6,8 @@ import numpy as np
 
 from warp_splat.camera import Camera
 from warp_splat.errors import InputError
-from warp_splat.formats.model_folder import open_model
+from warp_splat.formats.coordinates import read_coordinates
+from warp_splat.formats.model_folder import folder_of, open_model
 from warp_splat.formats.ply import GRAY
 from warp_splat.formats.splats import SplatFile
 from warp_splat.formats.stored import SH_C0
@@ -38,8 +39,7 @@ def random_points(cameras: list[Camera]) -> tuple[np.ndarray, np.ndarray]:
         kept.append(drawn)
         if sum(map(len, kept)) >= COUNT:
             break
-    found = np.concatenate(kept)
-    if len(found) < COUNT:
+    if len(found := np.concatenate(kept)) < COUNT:
         found = np.concatenate([found, _along_rays(cameras, extent, random)])
     return found[:COUNT].astype(np.float32), np.full((COUNT, 3), GRAY, np.uint8)
 
@@ -73,6 +73,7 @@ def load_start(path: str, report: Report) -> tuple[SplatFile, np.ndarray, np.nda
         InputError: if it is missing or not a file of Gaussians, or if there are none in it.
     """
     _, file, _ = open_model(path, report=report)
+    file = file._replace(coordinates=read_coordinates(folder_of(path)) or file.coordinates)
     if not len(file.splats.means):
         raise InputError(f"{path}: expected at least one Gaussian to start from, found none; name another file.")
     colors = (255 * (SH_C0 * file.splats.sh[:, 0].astype(np.float64) + 0.5)).clip(0, 255).round().astype(np.uint8)

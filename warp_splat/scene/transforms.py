@@ -66,8 +66,7 @@ def read_transforms(
 
 def _parse(path: Path) -> dict[str, Any]:
     with reading(path, "a JSON object"):
-        size = path.stat().st_size
-        if size > JSON_BYTES:
+        if (size := path.stat().st_size) > JSON_BYTES:
             raise InputError(f"{path}: expected at most {JSON_BYTES} bytes of JSON, found {size}; leave out frames.")
         kinds = (ValueError, RecursionError)  # of the syntax, of the encoding, or of the depth
         with refusing(kinds, f"{path}: expected JSON, but it cannot be parsed", "; correct it."):
@@ -79,8 +78,7 @@ def _parse(path: Path) -> dict[str, Any]:
 
 def _read_photos(path: Path, content: dict[str, Any], report: Report, native: bool) -> dict[str, Photo]:
     """The photo of each frame, by the frame's name; a photograph that has several frames has that of the first."""
-    frames = _value(content, "frames", path)
-    if not isinstance(frames, list) or not frames:
+    if not isinstance((frames := _value(content, "frames", path)), list) or not frames:
         raise _wrong(path, "a list of at least one frame under the key frames", frames)
     places = [f"{path}, frame {index}" for index in range(len(frames))]
     finder = ImageFinder(path.parent)
@@ -194,8 +192,7 @@ def _points(source: Path, name: Any, report: Report) -> tuple[np.ndarray, np.nda
 
 
 def _path(values: Any, key: str, where: str | Path) -> str:
-    name = _value(values, key, where)
-    if not isinstance(name, str):
+    if not isinstance((name := _value(values, key, where)), str):
         raise _wrong(where, f"a string as {key}", name)
     return Path(name).as_posix()
 

@@ -12,6 +12,7 @@ import numpy as np
 from warp_splat.camera import Camera
 from warp_splat.color import to_srgb
 from warp_splat.config import NEAR
+from warp_splat.errors import InputError
 from warp_splat.formats.coordinates import UP, read_coordinates
 from warp_splat.formats.splats import SplatFile
 
@@ -164,6 +165,14 @@ class Scene:
     def coordinates(self) -> dict | None:
         """Where the scene is in the world (``formats/coordinates.py``), if it says so."""
         return read_coordinates(self.source) if self.source else None
+
+    def refuse_other_origin(self, name: object, coordinates: dict | None) -> None:
+        """Raise InputError if Gaussians by this name and the scene both say where they are, and mean other frames."""
+        if coordinates and self.coordinates and coordinates["origin"] != self.coordinates["origin"]:
+            raise InputError(
+                f"{name}: expected Gaussians from the origin {self.coordinates['origin']} of {self.source}, found "
+                f"{coordinates['origin']}; name the scene that they were trained on, or train anew."
+            )
 
     @property
     def up(self) -> np.ndarray:

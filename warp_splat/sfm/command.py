@@ -7,6 +7,7 @@ import os
 import shlex
 import shutil
 import time
+import zlib
 from collections import defaultdict
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -15,6 +16,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from tqdm import tqdm
 
 from warp_splat.config import CORES, SfmConfig
@@ -31,6 +33,7 @@ from warp_splat.sfm.matching import match
 from warp_splat.text import few
 
 WORK = "sfm"  # the folder of the work inside the scene: what resuming needs
+MARKS, PIECE = "marks.json", 2**16  # numbers of so many bytes from the middle of each photograph
 LEAST = 3  # registered photographs; a scene of fewer shows nothing from another side
 FEW = 0.6  # share of registered photographs below which the user is told what to do
 ADVICE = (
@@ -122,8 +125,11 @@ def _claim(source: Path, scene: Path, config: SfmConfig) -> Path:
     else:
         files = [(source.name, source)]
     record = json.dumps({"options": options, "files": {name: path.stat().st_size for name, path in files}}, indent=1)
+    pieces = {name: np.fromfile(path, np.uint8, PIECE, offset=path.stat().st_size // 2) for name, path in files}
+    marks = json.dumps({name: zlib.crc32(piece) for name, piece in pieces.items()}, indent=1)  # once, there was none
     if (work / "input.json").is_file():
-        if (work / "input.json").read_bytes() != record.encode():
+        same = not (work / MARKS).is_file() or (work / MARKS).read_bytes() == marks.encode()
+        if not same or (work / "input.json").read_bytes() != record.encode():
             raise InputError(
                 f"{scene}: expected a folder begun with the same photographs and options, but this one was begun with "
                 "others; choose another folder, or remove this one."
@@ -132,6 +138,7 @@ def _claim(source: Path, scene: Path, config: SfmConfig) -> Path:
         raise InputError(f"{scene}: expected a new or empty folder, found one that is in use; choose another.")
     else:
         write_text(work / "input.json", record)
+        write_text(work / MARKS, marks)
     return work
 
 

@@ -59,8 +59,7 @@ def georeference(model: pycolmap.Reconstruction, database: Path, source: str, se
         known, reference = {name: np.array(numbers) for (name, *_), numbers in rows}, Path(source).name
     else:
         known, reference = _gps(database)
-    names = sorted(set(known) & set(centers))
-    if len(names) < LEAST:
+    if len(names := sorted(set(known) & set(centers))) < LEAST:
         if source == "auto":
             return None
         raise InputError(
@@ -81,6 +80,7 @@ def georeference(model: pycolmap.Reconstruction, database: Path, source: str, se
     _move(model, fitted)
     left_out = [name for name, good in zip(names, right, strict=True) if not good]
     rest = f"; left out: {few(left_out)}" if left_out else ""
+    rest += "; three always fit: give more" * int(right.sum() == LEAST)
     tops, ahead = np.stack([-axes[1], axes[2]]) @ fitted.rotation.matrix()[2]
     reference += DOUBT if tops < -TURNED or (tops < TURNED and ahead > TURNED) else ""
     say(f"coordinates: {reference}, {right.sum()} positions fit within {error:.2g} m (median){rest}")

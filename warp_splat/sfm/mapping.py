@@ -161,8 +161,7 @@ def held_together(model: pycolmap.Reconstruction) -> set[int]:
 
     Global mapping puts parts of a capture into one model that hardly anything holds together, each at any place.
     """
-    numbers = np.array(sorted(model.reg_image_ids()))
-    if not len(numbers):
+    if not len(numbers := np.array(sorted(model.reg_image_ids()))):
         return set()
     seen = [np.unique([element.image_id for element in point.track.elements]) for point in model.points3D.values()]
     rows = np.searchsorted(numbers, np.concatenate(seen)) if seen else np.zeros(0, int)

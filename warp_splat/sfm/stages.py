@@ -94,8 +94,7 @@ def extract(database: Path, root: Path, groups: list[list[str]], config: SfmConf
         reader = pycolmap.ImageReaderOptions()
         reader.camera_model = LENS
         with opened(database) as connection:
-            new = [name for name in names if not connection.exists_image(name)]
-            if len(new) < len(names):
+            if len(new := [name for name in names if not connection.exists_image(name)]) < len(names):
                 reader.existing_camera_id = connection.read_image_with_name((set(names) - set(new)).pop()).camera_id
         if new:
             pycolmap.import_images(database, root, pycolmap.CameraMode.SINGLE, new, reader)

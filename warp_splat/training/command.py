@@ -9,18 +9,21 @@ from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from tqdm import tqdm
 
 from warp_splat.config import MergeConfig
 from warp_splat.errors import InputError
 from warp_splat.formats import model_folder
 from warp_splat.formats.checkpoint import LAST, Checkpoint, load_own
+from warp_splat.formats.ply import load_points
 from warp_splat.runtime import pool
 from warp_splat.runtime.devices import memory_explained
 from warp_splat.runtime.distributed import GroupError, Processes, join
 from warp_splat.runtime.interrupts import interruptible
 from warp_splat.runtime.shards import Shards
 from warp_splat.scene.blocks import BLOCK, merge_blocks
+from warp_splat.scene.start import load_start
 from warp_splat.training import memory, opening
 from warp_splat.training.deadline import plan_training
 from warp_splat.training.loop import train_steps
@@ -72,6 +75,12 @@ def _train_blocks(config: TrainConfig) -> int:
             print(f"The same command with -m {folder} goes on with block {block}.")
             return code
     merge_blocks(MergeConfig(str(folder)))
+    before, (_, merged, _) = folder / "together" / "input.ply", load_start(str(folder), str)
+    if before.exists() and not np.array_equal(load_points(before)[0], merged):
+        raise InputError(
+            f"{before.parent}: expected a training of these blocks as they are now, found one of others, as one was "
+            "trained again; move that folder away, and the same command trains all of it anew."
+        )
     settled = {"settle_from_iter": 1, "cooldown": config.learn.iterations - 1, "coarse": 1}  # nothing grows, rates fall
     return _go_on(config, folder / "together", start_ply=str(folder), **settled)
 

@@ -33,8 +33,7 @@ def read_config(path: str | Path) -> dict[str, Any]:
             near = difflib.get_close_matches(name, options, 1)
             hint = f"did you mean {near[0]}?" if near else "warp-splat train --help lists them."
             raise InputError(f"--config {path}: {name}: no such option; {hint}")
-        item = options[name]
-        if not fits(value, item):
+        if not fits(value, (item := options[name])):
             choices = item.metadata["choices"]
             expected = f"one of {', '.join(map(repr, choices))}" if choices else KINDS[type(default_of(item))]
             raise InputError(f"--config {path}: {name}: expected {expected}, found {value!r:.60}; change it there.")
@@ -49,8 +48,7 @@ def load_options(path: str | Path) -> dict[str, Any]:
     """
     header, options = load_header(path), {item.name: item for item in flags_of(TrainConfig)}
     with reading(header.path, EXPECTED):
-        found = header.facts.get("options")
-        if not isinstance(found, dict):
+        if not isinstance((found := header.facts.get("options")), dict):
             raise Unexpected("one without options, as a block of one is; name the file that names the blocks")
         for name, value in found.items():
             if name not in options:

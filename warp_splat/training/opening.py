@@ -11,7 +11,7 @@ from warp_splat.errors import InputError
 from warp_splat.evaluation.perceptual import choose_metrics
 from warp_splat.formats import model_folder
 from warp_splat.formats.checkpoint import LAST, Checkpoint, load_own, remove_leftovers
-from warp_splat.formats.coordinates import write_coordinates
+from warp_splat.formats.coordinates import read_coordinates, write_coordinates
 from warp_splat.formats.ply import save_points
 from warp_splat.kernels.compiler import PORTABLE
 from warp_splat.raster.selftest import settle_device
@@ -138,6 +138,8 @@ def open_scene(config: TrainConfig, begun: Checkpoint | None, say: Say, processe
     same = {name: getattr(data, name) for name in OF_SCENE}
     memory = photo_memory(config.machine.photo_memory, processes)
     scene = load_scene(data.source_path, **same, start=start, memory=memory, report=say)
+    scene.refuse_other_origin(data.start_ply, scene.start and scene.start.coordinates)
+    scene.refuse_other_origin(begun and begun.path, begun and read_coordinates(begun.path.parent))
     if scene.random_points and not begun:
         say("Warning: the scene has no points to start from; random ones are taken, which trains worse.")
     if scene.start and not begun and scene.start.antialiased != config.model.antialiasing:

@@ -249,7 +249,6 @@ def check_train(config: TrainConfig) -> None:
         raise InputError("--position_lr_init, --position_lr_final: expected more than 0, for rates to decay between.")
     if config.grow.growth not in GROWTHS:
         raise InputError(f"--growth: expected one of {', '.join(GROWTHS)}, got {config.grow.growth!r:.50}.")
-    unknown = set(parts.split(",")) - {*PARTS} if parts and parts != AUTO else ()
-    if unknown:
+    if unknown := set(parts.split(",")) - {*PARTS} if parts and parts != AUTO else ():
         some = f"expected {AUTO}, or some of {', '.join(PARTS)} between commas"
         raise InputError(f"--parts: {some}, got {min(unknown)!r:.50}.")

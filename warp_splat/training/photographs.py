@@ -116,8 +116,7 @@ class Photographs:
 
     def camera_at(self, view: View, iteration: int) -> Camera:
         """The camera of ``view`` at the size of this iteration."""
-        shrink = shrink_at(self.config.learn, self.shares, iteration)
-        if shrink != self._shrink:
+        if (shrink := shrink_at(self.config.learn, self.shares, iteration)) != self._shrink:
             self._shrink, self._size = shrink, 0
             self.kept.clear()
         return view.camera if shrink == 1 else view.camera.resized(*_shrunk(view, shrink))

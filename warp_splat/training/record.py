@@ -218,8 +218,7 @@ def finish(trainer: Trainer, run: Run, say: Callable[[str], None]) -> None:
     if trainer.config.learn.settle_from_iter:  # a clock may have said so
         print(f"  flags     {as_flags(trainer.config)}")
         print(f"  time      {run.spent:.1f} s from the first step to the last")
-    dropped = run.dropped
-    if dropped["prunings"]:
+    if (dropped := run.dropped)["prunings"]:
         print(f"  warning   {dropped['prunings']} prunings would have removed every Gaussian and were refused")
     if dropped["pixels"] or dropped["gradients"] or dropped["gaussians"]:
         print(

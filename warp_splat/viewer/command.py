@@ -49,8 +49,7 @@ def _find_scene(finished: Finished, source_path: str) -> Scene | None:
     """
     try:
         given = finished.load_scene(source_path, print)
-        scene = finished.refined(given)
-        if scene is given:
+        if (scene := finished.refined(given)) is given:
             return scene
         views = [replace(view, name=f"{view.name}{AS_GIVEN}") for view in (*given.train, *given.test)]
         return replace(scene, test=[*scene.test, *views])

@@ -23,8 +23,7 @@ def is_own(host: str | None, origin: str | None, upgrade: bool) -> bool:
         upgrade: the request is for a WebSocket.
     """
     try:
-        name = urlsplit(f"//{host}").hostname or ""
-        if name not in ("localhost", socket.gethostname().lower()):
+        if (name := urlsplit(f"//{host}").hostname or "") not in ("localhost", socket.gethostname().lower()):
             ipaddress.ip_address(name)
     except ValueError:
         return False

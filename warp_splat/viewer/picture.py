@@ -34,8 +34,7 @@ def depth_range(depth: torch.Tensor, alpha: torch.Tensor) -> tuple[float, float]
         alpha: [H, W]; pixels that are mostly empty do not count.
     """
     step = max(1, depth.numel() // SAMPLES)
-    seen = depth.flatten()[::step][alpha.flatten()[::step] > 0.5]
-    if not len(seen):
+    if not len(seen := depth.flatten()[::step][alpha.flatten()[::step] > 0.5]):
         return NEAR, 1.0
     low, high = torch.quantile(seen, torch.tensor(DEPTH_SHARES, device=depth.device)).tolist()
     return max(low, NEAR), max(high, NEAR, low * (1 + 1e-3))

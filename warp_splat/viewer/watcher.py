@@ -79,8 +79,7 @@ class Watcher:
     def _step(self, event) -> None:
         names = list(self.views)
         place = names.index(self.view.value) if self.view.value in names else -(event.target.value == "next")
-        chosen = names[(place + STEPS[event.target.value]) % len(names)]
-        if chosen == self.view.value:
+        if (chosen := names[(place + STEPS[event.target.value]) % len(names)]) == self.view.value:
             self._jump()
         else:
             self.view.value = chosen  # which calls _jump
@@ -105,8 +104,7 @@ class Watcher:
         browser = self.client.camera
         free = browser_camera(browser.wxyz, browser.position, browser.fov, browser.image_width, browser.image_height)
         free = sized(free, pixels)
-        view = self.views.get(self.view.value) if self.views else None
-        if view is not None:
+        if (view := self.views.get(self.view.value) if self.views else None) is not None:
             if is_at(free, view.camera, float(np.linalg.norm(np.asarray(browser.look_at) - view.camera.center))):
                 camera, box = framed(view.camera, free.width, free.height)
                 return camera, view, box

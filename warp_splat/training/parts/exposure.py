@@ -49,8 +49,7 @@ class Exposure:
     @classmethod
     def needed(cls, scene: Scene) -> Verdict:
         """If photographs differ in brightness or tint, as the colors of points in them tell."""
-        gains = gains_of(scene)
-        if not gains.stops:
+        if not (gains := gains_of(scene)).stops:
             return Verdict(False, "the scene does not say which points photographs saw, so exposure is not measured")
         stops = [gain[GREEN] for gain in gains.stops.values()]
         span = f"({min(stops):+.2f} to {max(stops):+.2f} in all)"

@@ -99,8 +99,7 @@ class Pose:
 
     def _rate(self, iteration: int) -> float:
         """0 until there is something to compare with; then it falls."""
-        start = self.options.pose_from_iter
-        if iteration < start:
+        if iteration < (start := self.options.pose_from_iter):
             return 0.0
         return self.options.pose_lr * power(LAST_RATE, iteration - start, max(self.iterations - start, 1))
 
