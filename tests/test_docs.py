@@ -63,8 +63,8 @@ PROOFS = {
         test_sog.py::test_sog_bytes_are_the_documented_layout test_sog.py::test_a_palette_stands_for_many_harmonics
         test_sog.py::test_archives_of_others_are_read""",
     "`.glb`, `.gltf`": """
-        test_exchange.py::test_gltf_holds_what_the_extension_says
-        test_exchange.py::test_gltf_nodes_move_turn_and_scale""",
+        test_gltf.py::test_gltf_holds_what_the_extension_says
+        test_gltf.py::test_gltf_nodes_move_turn_and_scale""",
     "`.usd`, `.usda`, `.usdc`, `.usdz`": """
         test_usd.py::test_a_stage_holds_what_the_schema_says_and_comes_back
         test_usd.py::test_fields_are_joined_as_their_parents_place_them""",
