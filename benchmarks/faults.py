@@ -105,7 +105,8 @@ def main() -> None:
             figures = (f"{value:.2f}" for value in (untouched, same, broken, cured))
             rows.append((fault, told, *figures, share, f"{100 * np.median(errors):.1f} %, {100 * errors.max():.1f} %"))
             print(*rows[-1], f"{time.perf_counter() - started:.0f} s", flush=True)
-    note = f"dB of held-out views, which have no fault, drawn without maps; {STEPS} steps, an edge of 66 px, seed {arguments.seed}. Errors are those of light."
+    note = f"dB of held-out views, which have no fault, drawn without maps; {STEPS} steps, an edge of 66 px, seed "
+    note += f"{arguments.seed}. Errors are those of light."
     write_table("faults", arguments.out, HEADERS, rows, note, {"rows": rows})
 
 
