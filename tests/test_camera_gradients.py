@@ -134,35 +134,6 @@ def test_the_oracle_agrees_with_differences():
             assert (ends[0] - ends[1]) / 2e-5 == pytest.approx(float(gradient[row > 0]), rel=1e-5, abs=1e-6)
 
 
-@pytest.mark.parametrize("name", ["degree2", pytest.param("panorama", id="rolling")])
-def test_planes_know_where_the_camera_stands(name):
-    """The center, against differences of the camera's own; and through a picture of one wide Gaussian."""
-    numbers = {key: leaf.detach() for key, leaf in learned(scene_of(name).camera, THERE).items() if "twist" in key}
-
-    def center(**moved):
-        return torch.from_numpy(CameraParameters(scene_of(name).camera, **{**numbers, **moved}).camera.center)
-
-    for key, number in numbers.items():
-        leaf = number.double().requires_grad_()
-        found = CameraParameters(scene_of(name).camera, **{**numbers, key: leaf}).center()
-        torch.testing.assert_close(found.detach().double(), center(), rtol=1e-6, atol=1e-6)
-        jacobian = torch.stack([torch.autograd.grad(part, leaf, retain_graph=True)[0] for part in found])
-        steps = 1e-4 * torch.eye(6, dtype=torch.float64)
-        ends = [torch.stack([center(**{key: leaf.detach() + sign * step}) for step in steps]) for sign in (1, -1)]
-        torch.testing.assert_close(jacobian, (ends[0] - ends[1]).T / 2e-4, rtol=1e-5, atol=1e-6)
-
-    wide = torch.tensor([[0.0, 0.0, 5.0]]), torch.tensor([[1.0, 0, 0, 0]]), torch.tensor([[20.0, 20.0, 0.1]])
-    camera, twist = scenes.make_camera(16, 16, seed=None), torch.zeros(6, dtype=torch.float64, requires_grad=True)
-
-    def planes(twist):
-        given = *wide, torch.tensor([0.9]), torch.zeros(1, 1, 3), CameraParameters(camera, twist)
-        return rasterize(*given, options=RasterOptions(normals=True)).planes.double().mean()
-
-    planes(twist).backward()
-    step = 0.01 * torch.eye(6, dtype=torch.float64)[5]
-    assert twist.grad[5] == pytest.approx(float(planes(step) - planes(-step)) / 0.02, rel=1e-3)
-
-
 @pytest.mark.parametrize(
     ("name", "options"),
     [

@@ -132,8 +132,10 @@ def test_gltf_quantized_attributes(tmp_path):
 def test_gltf_nodes_that_are_hidden_repeated_or_too_far_away(tmp_path):
     """A child of a hidden node is hidden, too; what 32 bits round, and instances, are told."""
     hidden = {"KHR_node_visibility": {"visible": False}}
-    nodes = [{"mesh": 0}, {"children": [2], "extensions": hidden}, {"mesh": 0}]
-    before = place(tmp_path, nodes, scenes=[{"nodes": [0, 1]}], extensionsUsed=[NAME, "EXT_mesh_gpu_instancing"])
+    hidden["KHR_node_visibility"]["extras"] = {}
+    repeated = {"mesh": 0, "extensions": {"EXT_mesh_gpu_instancing": {}}}
+    nodes = [repeated, {"children": [2], "extensions": hidden}, {"mesh": 0}]
+    before = place(tmp_path, nodes, scenes=[{"nodes": [0, 1]}], extensionsRequired=["KHR_node_visibility"])
     lines = []
     assert len(load_gaussians(tmp_path / "b.glb", lines.append).splats.means) == len(before.means)
     assert len(lines) == 1 and "EXT_mesh_gpu_instancing repeats nothing here" in lines[0]
@@ -141,6 +143,6 @@ def test_gltf_nodes_that_are_hidden_repeated_or_too_far_away(tmp_path):
     lines.clear()
     load_gaussians(tmp_path / "b.glb", lines.append)
     assert len(lines) == 1 and "positions are rounded to steps of 0.5; move it nearer" in lines[0]
-    place(tmp_path, [{"mesh": 0, "translation": [5e3, 0, 5e3]}])
+    place(tmp_path, [{"mesh": 0, "translation": [5e3, 0, 5e3], "extensions": ["x"]}])
     load_gaussians(tmp_path / "b.glb", lines.append)
     assert len(lines) == 1

@@ -17,14 +17,14 @@ from warp_splat.color import from_srgb
 from warp_splat.errors import InputError
 from warp_splat.formats.coordinates import kept
 from warp_splat.formats.files import Unexpected, atomic_write, entries_of, reading, write_bytes
-from warp_splat.formats.gltf_container import CHUNK, HEADER, Document
+from warp_splat.formats.gltf_container import CHUNK, HEADER, VISIBILITY, Document, held
 from warp_splat.formats.splats import COEFFICIENTS, SplatArrays, SplatFile, concatenated, decompose, frame, turned
 from warp_splat.formats.stored import LOG_SCALES, SH_C0, clipped, log_scales, logit, sigmoid, unit_quats
 from warp_splat.text import Report
 
 NAME = "KHR_gaussian_splatting"
 AXES = "LUF"
-UNDERSTOOD = {NAME, "KHR_mesh_quantization"}  # extensions that a file may require
+UNDERSTOOD = {NAME, "KHR_mesh_quantization", VISIBILITY}  # extensions that a file may require
 COLOR_SPACES = ("srgb_rec709_display", "lin_rec709_display")  # as photographs have it; in linear light
 RENDER_MODE = "SplatRenderMode"
 INSTANCES = "EXT_mesh_gpu_instancing"
@@ -102,13 +102,13 @@ def load_gltf(path: str | Path, report: Report = print) -> SplatFile:
         linear = {extension.get("colorSpace") == COLOR_SPACES[1] for extension in told}
         if len(linear) > 1:
             raise Unexpected("meshes of which some are in linear light and some are not; export them alike")
-        mip = [_extra(extension, RENDER_MODE) == "mip" for extension in told]
-        if INSTANCES in entries_of(document.json, "extensionsUsed"):
+        mip = [held(extension, "extras").get(RENDER_MODE) == "mip" for extension in told]
+        if any(INSTANCES in held(node, "extensions") for node in entries_of(document.json, "nodes")):
             notes.append(f"{INSTANCES} repeats nothing here; export nodes instead to draw all")
         notes += [SOME_MIP] * (any(mip) and not all(mip))
     for note in dict.fromkeys(notes):
         report(f"{path}: {note}.")
-    return SplatFile(concatenated(parts), all(mip), kept(_extra(document.json, COORDINATES)), linear.pop())
+    return SplatFile(concatenated(parts), all(mip), kept(held(document.json, "extras").get(COORDINATES)), linear.pop())
 
 
 def _attributes(splats: SplatArrays, in_linear: bool, report: Report) -> dict[str, np.ndarray]:
@@ -194,9 +194,3 @@ def _read_primitive(document: Document, primitive: dict, report: Report) -> Spla
         scales=scales if (scales < 0).any() else log_scales(scales),
         quats=rotations[:, [3, 0, 1, 2]],
     )
-
-
-def _extra(entry: dict, name: str) -> object:
-    """What an object holds beyond the standard; None without it."""
-    extras = entry.get("extras")
-    return extras.get(name) if isinstance(extras, dict) else None

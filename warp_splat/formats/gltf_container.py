@@ -21,6 +21,13 @@ JSON_BYTES = 2**22  # a thousand times that of a file of Gaussians, and a hundre
 MOST_BUFFERS = 256  # files to look for; the Gaussians of a scene are in one or a few
 COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
 TYPES = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
+VISIBILITY = "KHR_node_visibility"
+
+
+def held(entry: object, name: str) -> dict:
+    """The object by that name in another; an empty one, if it is none."""
+    found = entry.get(name) if isinstance(entry, dict) else None
+    return found if isinstance(found, dict) else {}
 
 
 class Buffer(NamedTuple):
@@ -106,7 +113,7 @@ class Document:
             if index in seen:
                 raise Unexpected(f"node {index} in two places")
             seen.add(index)
-            if (node.get("extensions") or {}).get("KHR_node_visibility") == {"visible": False}:
+            if held(held(node, "extensions"), VISIBILITY).get("visible") is False:
                 continue
             if not np.isfinite(world := parent @ _matrix(node)).all():
                 raise ValueError(f"node {index} has a transform that is not finite")

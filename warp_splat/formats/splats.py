@@ -133,10 +133,10 @@ def turned(
         )
 
 
-def decompose(matrix: np.ndarray, report: Report) -> tuple[np.ndarray, np.ndarray, float]:
+def decompose(matrix: np.ndarray, report: Report, unit: float = 1.0) -> tuple[np.ndarray, np.ndarray, float]:
     """Rotation [3, 3], translation [3] and scale of a transform [4, 4]; a mirror is part of the rotation.
 
-    ``report`` is told of a place so far away that float32 rounds it by more than a thousandth.
+    ``report`` is told of a place that float32 rounds by more than a thousandth, in ``unit`` of ours.
 
     Raises:
         Unexpected: if it stretches or shears, which would need other Gaussians.
@@ -146,7 +146,7 @@ def decompose(matrix: np.ndarray, report: Report) -> tuple[np.ndarray, np.ndarra
     turn = linear / scale if 0 < scale < math.inf else np.zeros((3, 3))
     if not np.allclose(turn.T @ turn, np.eye(3), atol=EVEN):
         raise Unexpected("a node that stretches or shears; apply its transform to the Gaussians before the export")
-    if (step := np.spacing(np.float32(np.abs(matrix[:3, 3]).max()))) > 1e-3:
+    if (step := np.spacing(np.float32(unit * np.abs(matrix[:3, 3]).max()))) > 1e-3:
         report(f"so far from the origin, positions are rounded to steps of {step:.2g}; move it nearer")
     u, _, v = np.linalg.svd(turn)
     return u @ v, matrix[:3, 3], scale

@@ -131,7 +131,7 @@ def load_usd(path: str | Path, report: Report = print) -> SplatFile:
         parts, places = [], UsdGeom.XformCache(now)
         for prim in prims:
             world = np.array(places.GetLocalToWorldTransform(prim)).T  # USD multiplies from the left
-            turn, translation, scale = decompose(world, notes.append)
+            turn, translation, scale = decompose(world, notes.append, unit)
             splats = _read_prim(prim, now, notes.append)
             parts.append(turned(splats, axes @ turn, unit * (axes @ translation), unit * scale))
         mip = [prim.GetCustomDataByKey(RENDER_MODE) == "mip" for prim in prims]

@@ -47,7 +47,7 @@ def blend_beside(
     """
     channels, found, options = {} if features is None else {"features": features}, {}, blending.options
     if options.normals:
-        center = camera.center() if isinstance(camera, CameraParameters) else camera.center.tolist()
+        center = (camera.camera if isinstance(camera, CameraParameters) else camera).center.tolist()
         # number by number, since a copy of the center would make a GPU wait
         away = torch.stack([mean - value for mean, value in zip(gaussians.means.unbind(1), center, strict=True)], 1)
         normals = normals_of(gaussians, away.detach())

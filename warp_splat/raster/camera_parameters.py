@@ -31,7 +31,8 @@ class CameraParameters:
 
     Their gradients are those of the image that is drawn. Sums have one order, whatever the threads and the processor.
     Where the Jacobian of the affine projection is clamped, and how far a lens is followed, stays as ``base`` has it: it
-    does not move with intrinsics and coefficients.
+    does not move with intrinsics and coefficients. Nor has ``planes`` of :class:`warp_splat.RenderOutput` a gradient by
+    the place from which distances are taken, but for that of its weights.
 
     Args:
         base: the camera to start from.
@@ -96,19 +97,6 @@ class CameraParameters:
             return _twisted(base, "twist", self.twist)
         first = _twisted(base.at(-0.5), "twist", self.twist)
         return Camera.rolling(first, _twisted(base.at(base.height - 0.5), "last_twist", self.last_twist))
-
-    def center(self) -> torch.Tensor:
-        """Of the camera in the world [3], when its middle row is read; with gradients."""
-        ends = [(self.base, self.twist)]
-        if self.last_twist is not None:
-            ends = [(self.base.at(-0.5), self.twist), (self.base.at(self.base.height - 0.5), self.last_twist)]
-        return torch.stack([_center(*end) for end in ends]).mean(0)
-
-
-def _center(base: Camera, twist: torch.Tensor) -> torch.Tensor:
-    against = torch.linalg.cross(twist[:3].expand(3, 3), torch.eye(3).to(twist))  # the turn backwards
-    shift = torch.from_numpy(base.rotation.T.copy()).to(twist) @ torch.linalg.matrix_exp(against) @ twist[3:]
-    return torch.from_numpy(base.center).to(twist) - shift
 
 
 def _twisted(base: Camera, name: str, tensor: torch.Tensor) -> Camera:

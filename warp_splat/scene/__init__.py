@@ -92,11 +92,10 @@ def load_scene(
     if part := block_of(block, points, [photo.camera for photo in train]) if block else None:
         counts = len(train), len(points)
         shown = np.array([part.shown(photo.camera, points) for photo in (*train, *test)])
-        if empty := np.flatnonzero(~shown[: len(train)].any(0)).tolist():  # of any: before others are trained in vain
-            found = f"none of block {empty[0] + 1}"
-            raise InputError(f"--block {block}: expected photographs of each, found {found}; take fewer blocks.")
-        own = shown[:, part.number]
+        own, part = shown[:, part.number], part._replace(empty=np.flatnonzero(~shown[: len(train)].any(0)).tolist())
         train, test = list(compress(train, own)), list(compress(test, own[len(train) :]))
+        if not train:
+            raise InputError(f"--block {block}: expected photographs that show it, found none; take fewer blocks.")
         rows = part.starts([photo.camera for photo in train], points)
         points, colors, file = points[rows], colors[rows], file and file._replace(splats=file.splats.take(rows))
         report(f"Block {block}: {len(train)} of {counts[0]} training images, {len(points)} of {counts[1]} points.")

@@ -34,6 +34,7 @@ class Block(NamedTuple):
 
     number: int  # from 0
     cells: np.ndarray  # [N, 2, 3] of all blocks, in world coordinates: from (within), and to (without)
+    empty: Sequence[int] = ()  # of those, what no photograph shows
 
     def holds(self, points: np.ndarray) -> np.ndarray:
         """Which of ``points`` [P, 3] lie in it, [P] bool."""

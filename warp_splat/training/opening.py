@@ -140,6 +140,9 @@ def open_scene(config: TrainConfig, begun: Checkpoint | None, say: Say, processe
     scene = load_scene(data.source_path, **same, start=start, memory=memory, report=say)
     scene.refuse_other_origin(data.start_ply, scene.start and scene.start.coordinates)
     scene.refuse_other_origin(begun and begun.path, begun and read_coordinates(begun.path.parent))
+    if not begun and scene.block and scene.block.empty:  # before blocks are trained that could not be merged
+        which = f"none of block {scene.block.empty[0] + 1}"
+        raise InputError(f"--block {data.block}: expected photographs of each, found {which}; take fewer blocks.")
     if scene.random_points and not begun:
         say("Warning: the scene has no points to start from; random ones are taken, which trains worse.")
     if scene.start and not begun and scene.start.antialiased != config.model.antialiasing:
