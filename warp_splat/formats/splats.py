@@ -146,8 +146,8 @@ def decompose(matrix: np.ndarray, report: Report, unit: float = 1.0) -> tuple[np
     turn = linear / scale if 0 < scale < math.inf else np.zeros((3, 3))
     if not np.allclose(turn.T @ turn, np.eye(3), atol=EVEN):
         raise Unexpected("a node that stretches or shears; apply its transform to the Gaussians before the export")
-    if (step := np.spacing(np.float32(unit * np.abs(matrix[:3, 3]).max()))) > 1e-3:
-        report(f"so far from the origin, positions are rounded to steps of {step:.2g}; move it nearer")
+    if (step := 2.0**-23 * unit * np.abs(matrix[:3, 3]).max()) > 2e-3:
+        report(f"so far from the origin, positions are rounded to steps of about {step:.1g}; move it nearer")
     u, _, v = np.linalg.svd(turn)
     return u @ v, matrix[:3, 3], scale
 
