@@ -107,6 +107,14 @@ def test_the_faintest_make_room(due, pruned, split):
     assert (change.pruned, change.split, len(model)) == (pruned, split, due)
 
 
+def test_a_later_end_takes_no_gaussian_away():
+    """As a training that goes on may have; the plan would have fewer by now."""
+    model = GaussianModel.from_points(np.zeros((100, 3)), np.zeros((100, 3), np.uint8), 0)
+    growth = growth_on(model, 120, iterations=4000)
+    growth.start = 50
+    assert [growth._due(iteration) for iteration in (600, 3000, 3900)] == [100, 109, 120]
+
+
 def test_what_pulls_most_is_split():
     """By the mean over the views that showed it; what goes are the faintest."""
     model = GaussianModel.from_points(np.random.default_rng(0).normal(size=(100, 3)), np.zeros((100, 3), np.uint8), 0)

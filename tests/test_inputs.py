@@ -1,5 +1,7 @@
 """Stems, starts, alpha, linear light: against formulas that share nothing with the loader."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -10,6 +12,7 @@ from scene_files import (
     load,
     project,
     texture,
+    write_blender,
     write_colmap,
     write_floats,
     write_image,
@@ -35,6 +38,14 @@ def test_images_are_found_by_their_stems(tmp_path):
     assert lines == ["Taking 1 of 2 images by their stems: b.PNG for sub/b.png, ..."]
     write_image(root / "images" / "sub" / "b.tif", texture())
     refusal(lambda: load(root), "several of this stem (b.PNG, b.tif)")
+
+
+def test_without_an_ending_png_goes_first(tmp_path):
+    """As in the reference, which adds .png: a preview lies beside it."""
+    root = write_blender(tmp_path)
+    photo = min((root / "train").glob("*.png"))
+    write_image(photo.with_suffix(".jpg"), texture())
+    assert photo.name in {Path(view.name).name for view in load(root)[0].train}
 
 
 @pytest.mark.parametrize("name", ["../a.png", "/etc/passwd", "sub/../../a.png"])

@@ -267,6 +267,9 @@ def test_files_and_checkpoints(scene, tmp_path, fails):
     file = tmp_path / "a.toml"
     file.write_text("minutes = 3\niterations = 5\n")
     assert "expected no --iterations beside it" in fails("train", "--config", str(file))
+    file.write_text("minutes = 3\n")
+    assert "expected no --cooldown beside it" in fails("train", "--config", str(file), "--cooldown", "7")
+    assert parse(["train", "--config", str(file), "--cooldown", "7", "--iterations", "50"]).learn.end == 50
     file.write_text("settle_from_iter = 3\niterations = 500\n")
     config = parse(["train", "-s", "x", "--config", str(file), "--minutes", "2"])
     assert config.learn.end == 1003 and config.data.preset == "fast" and config.learn.iterations == 500

@@ -93,8 +93,10 @@ def test_cameras_test_first_at_original_size(tmp_path):
     model_folder.write_cameras(tmp_path, test, train)
     entries = json.loads((tmp_path / "cameras.json").read_text())
     assert [(entry["id"], entry["img_name"]) for entry in entries] == [(0, "a/1.jpg"), (1, "2.jpg"), (2, "3.jpg")]
+    assert model_folder.trained_names(tmp_path) == {"2.jpg", "3.jpg"}
     for entry, expected in zip(entries, test + train, strict=True):
-        assert list(entry) == ["id", "img_name", "width", "height", "position", "rotation", "fy", "fx", "cx", "cy"]
+        numbers = ["width", "height", "position", "rotation", "fy", "fx", "cx", "cy"]
+        assert list(entry) == ["id", "img_name", *numbers, "trained"]
         assert (entry["width"], entry["height"], entry["fx"], entry["fy"]) == (800, 600, 700, 710)
         camera_from_world = np.eye(4)
         camera_from_world[:3, :3], camera_from_world[:3, 3] = expected.original.rotation, expected.original.translation

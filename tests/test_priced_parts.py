@@ -92,6 +92,10 @@ def test_geometry_learns_from_it(scene, tmp_path):
 def test_maps_are_read_as_the_reference_writes_them(mapped):
     scene, folder = mapped
     maps = read_inverse_depths(scene, "depths")
+    (folder / PARAMETERS).rename(folder / "depth_params.json"), shutil.rmtree(folder / "sparse")  # no COLMAP model
+    assert all(np.array_equal(found, maps[view]) for view, found in read_inverse_depths(scene, "depths").items())
+    told = f"1 of {len(scene.train)} depth maps are left out, of scales far from the median."
+    assert told in begin(scene, folder / "model", depths="depths")[0].told
     assert scene.train[2] not in maps and len(maps) == len(scene.train) - 1  # far from the median scale
     for index, step in ((0, 8), (7, 1)):
         view = scene.train[index]

@@ -8,6 +8,7 @@ from functools import partial
 
 import av
 import numpy as np
+import pycolmap
 import pytest
 from commands import SCENE, full_disk
 from hostile import refusal
@@ -249,6 +250,18 @@ def test_render_says_that_the_scene_is_another(told, tmp_path, capsys):
     for source, said in ((tmp_path / "other", True), (SCENE, False)):
         assert main(["render", "-s", str(source), *options]) == 0
         assert (f"the model was trained on {SCENE}" in capsys.readouterr().out) == said
+
+
+def test_photographs_that_were_trained_on_test_nothing(told, tmp_path, fails):
+    """One photograph less, and every eighth is another; what was measured stays."""
+    scene, before = shutil.copytree(SCENE, tmp_path / "scene"), (told / "results.json").read_bytes()
+    model = pycolmap.Reconstruction(scene / "sparse" / "0")
+    model.deregister_frame(model.find_image_with_name("view_000.png").frame_id)
+    model.write(scene / "sparse" / "0")
+    words = "render", "-m", told, "-s", scene, "--quiet"
+    assert "found 7 that were trained on, such as view_001.png; name the scene of then" in fails(*words)
+    assert "trained on" in fails("simplify", told, "-s", scene, "--keep", "0.5", "-o", tmp_path / "a.ply")
+    assert main([*map(str, words), "--skip_test"]) == 0 and (told / "results.json").read_bytes() == before
 
 
 @pytest.mark.parametrize(

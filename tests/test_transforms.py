@@ -1,5 +1,7 @@
 """Cameras in JSON, and lenses: against formulas that share nothing with the loader."""
 
+import json
+
 import numpy as np
 import pytest
 from hostile import refusal
@@ -42,6 +44,16 @@ def test_transforms_intrinsics_of_frames_go_before_those_of_the_file(tmp_path):
     root = write_transforms(tmp_path, frame=lambda index: {"fl_x": 50.0, "fl_y": 51.0, "cx": 20} if index else {})
     cameras = [view.camera for view in load(root)[0].train]
     assert [(c.fx, c.fy, c.cx, c.cy) for c in cameras] == [(40, 44, 22.5, 17.25), (50, 51, 20, 17.25)]
+
+
+def test_transforms_angles_of_both_axes(tmp_path):
+    root = write_transforms(tmp_path, camera_angle_x=1.0, camera_angle_y=0.8)
+    content = json.loads((root / "transforms.json").read_text())
+    for known, fy in (({"fl_x": 50.0, "fl_y": 51.0}, 51.0), ({"fl_x": 50.0}, 50.0), ({}, 0.5 * HEIGHT / np.tan(0.4))):
+        kept = {key: value for key, value in content.items() if not key.startswith("fl_")}
+        (root / "transforms.json").write_text(json.dumps(kept | known))
+        camera = load(root)[0].train[0].camera
+        assert (camera.fx, camera.fy) == pytest.approx((known.get("fl_x", 0.5 * WIDTH / np.tan(0.5)), fy))
 
 
 def test_transforms_sizes_twice_those_of_the_files(tmp_path):

@@ -119,6 +119,7 @@ def parse(arguments: list[str]) -> Any:
 
         if (file := read_config(values["config"])).get("minutes"):
             _check_minutes(file)
+            _check_minutes(given if "iterations" in given else {"minutes": file["minutes"], **given})
         values = _over(file, values)
     if values.get("start_checkpoint"):
         values = _continued(values)
@@ -155,8 +156,7 @@ def _continued(given: dict) -> dict:
     source = given["start_checkpoint"]
     options = load_options(source)
     for name, reason in FIXED_OPTIONS.items():
-        kept = options[name]
-        if given.get(name, kept) != kept:
+        if given.get(name, (kept := options[name])) != kept:
             kept = "none" if kept == "" else kept
             raise InputError(f"--{name} {given[name]}: expected {kept}, as in {source} ({reason}); leave it out.")
     if given.get("minutes") and not options["minutes"]:

@@ -66,8 +66,7 @@ class Renderer:
         with suppress(OSError):  # it has died since the last answer
             self.connection.send((given, workload.camera, None if upstream is None else upstream.numpy(), runs))
         image, gradients, same = self._receive(self.limit * runs)
-        shape = (workload.camera.height, workload.camera.width, 3)
-        if image.shape != shape:
+        if image.shape != (shape := (workload.camera.height, workload.camera.width, 3)):
             raise RendererFailed(f"returned shape {image.shape}, not {shape}")
         if image.dtype != np.uint8 and image.dtype.kind != "f":
             raise RendererFailed(f"returned {image.dtype}, neither floats nor uint8")

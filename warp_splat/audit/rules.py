@@ -115,8 +115,7 @@ def find_extent(prober: Prober) -> str:
 def find_clamp(prober: Prober) -> str:
     """The largest alpha."""
     top = prober.cover([CENTER], 3.0, 9.0, OPAQUE)[23, 31]
-    step = max(prober.seen, 2e-6)
-    if top > OPAQUE - 2 * step:
+    if top > OPAQUE - 2 * (step := max(prober.seen, 2e-6)):
         prober.options["alpha_max"] = 0.9999
         return f"Alpha is not clamped below {OPAQUE - 2 * step:.4g}."
     name = prober.measured("alpha_max", top - step, min(top + step, 1))

@@ -44,8 +44,7 @@ def shown(splats: SplatArrays, most: int = 0) -> SplatArrays:
         splats: finite Gaussians.
         most: the largest number to keep, by opacity times the area of the largest section; 0 keeps all.
     """
-    opacities = sigmoid(splats.opacities)
-    rows = np.flatnonzero((opacities >= ALPHA_MIN) & splats.quats.any(axis=1))
+    rows = np.flatnonzero((sigmoid(splats.opacities) >= ALPHA_MIN) & splats.quats.any(axis=1))
     if 0 < most < len(rows):
         rows = np.sort(rows[np.argsort(-sizes(splats)[rows], kind="stable")[:most]])
     return splats.take(rows)

@@ -235,8 +235,7 @@ def load_own(path: str | Path, rows: Rows) -> Checkpoint:
     Raises:
         InputError: as that does, or if a block is missing or of another checkpoint.
     """
-    whole = load_checkpoint(path)
-    if BLOCKS not in whole.facts and not rows.sharded:
+    if BLOCKS not in (whole := load_checkpoint(path)).facts and not rows.sharded:
         return whole
     blocks = whole.facts.get(BLOCKS, {whole.path.name: len(whole.arrays.get("radii", ()))})
     with reading(whole.path, EXPECTED):

@@ -108,8 +108,7 @@ def _harmonics(tables: PlyTables, count: int) -> np.ndarray:
     names = [f"f_rest_{index}" for index in range(len(tables.elements["sh"].properties))]
     if len(names) not in (9, 24, 45):
         raise Unexpected(f"{len(names)} properties of harmonics, not 9, 24 or 45")
-    steps = _columns(tables, "sh", names, "u1")
-    if len(steps) != count:
+    if len(steps := _columns(tables, "sh", names, "u1")) != count:
         raise ValueError(f"harmonics of {len(steps)} of {count} Gaussians")
     values = (steps + np.float32(0.5) - 128) / np.float32(HARMONIC_STEPS)
     values = np.where(steps == 0, HARMONICS[0], np.where(steps == 255, HARMONICS[1], values)).astype(np.float32)
@@ -120,8 +119,7 @@ def _columns(tables: PlyTables, element: str, names: Sequence[str], code: str) -
     """The properties [N, len(names)] of an element, which have to have the type ``code``."""
     if element not in tables.elements:
         raise Unexpected(f"a compressed one without an element {element!r}")
-    properties = tables.elements[element].properties
-    if wrong := [name for name in names if properties.get(name) != code]:
+    if wrong := [name for name in names if tables.elements[element].properties.get(name) != code]:
         raise Unexpected(f"a compressed one whose {element} lacks {', '.join(wrong):.200} of type {code}")
     return columns_of(tables.rows(element), names, code)
 

@@ -224,8 +224,8 @@ def write_cameras(
     """
     origin = {"origin": coordinates["origin"]} if coordinates else {}
     cameras = [
-        {"id": index, "img_name": view.name, **camera_entry(view.original), **origin}
-        for index, view in enumerate([*views_test, *views_train])
+        {"id": i, "img_name": view.name, **camera_entry(view.original), **origin, "trained": i >= len(views_test)}
+        for i, view in enumerate([*views_test, *views_train])
     ]
     write_text(Path(folder) / CAMERAS, json.dumps(cameras, allow_nan=False))
 
@@ -257,6 +257,17 @@ def read_cameras(folder: str | Path) -> list[tuple[str, Camera]]:
 
     path = Path(folder) / CAMERAS
     return read_json(path, "a list of cameras as training writes it", parse) if path.exists() else []
+
+
+def trained_names(path: str | Path) -> set[str]:
+    """The photographs that the model in a folder was trained on, if its ``cameras.json`` says so.
+
+    Raises:
+        InputError: if the file is damaged.
+    """
+    names = lambda entries: {str(entry["img_name"]) for entry in entries if entry.get("trained")}  # noqa: E731
+    file = folder_of(path) / CAMERAS
+    return read_json(file, "a list of cameras as training writes it", names) if file.exists() else set()
 
 
 def read_refined(path: str | Path, iteration: int) -> dict[str, Camera]:

@@ -96,8 +96,7 @@ def load_points(path: str | Path, report: Report = print) -> tuple[np.ndarray, n
     """
     with reading(path, EXPECTED), open(path, "rb") as file:
         vertex = PlyTables(file).rows("vertex")
-        names = vertex.dtype.names or ()
-        if not set(POSITION) <= set(names):
+        if not set(POSITION) <= set(names := vertex.dtype.names or ()):
             found = f"{', '.join(names):.200}"
             raise InputError(f"{path}: expected a point cloud with properties x, y and z, found {found}.")
         points = columns_of(vertex, POSITION)

@@ -134,7 +134,6 @@ class PlyTables:
         return rows
 
     def _header_line(self) -> str:
-        line = self.file.readline(HEADER_BYTES - self.file.tell())
-        if not line.endswith(b"\n"):
+        if not (line := self.file.readline(HEADER_BYTES - self.file.tell())).endswith(b"\n"):
             raise Unexpected(f"no line 'end_header' within the first {HEADER_BYTES} bytes")
         return line.decode("latin-1").strip()  # any byte is a character; comments may hold them

@@ -160,8 +160,7 @@ def _check_spread(subject: Subject, points: np.ndarray) -> Iterator[Finding]:
     elif len(centers) > 2:
         _, _, axes = np.linalg.svd(centers - centers.mean(axis=0))
         around = np.sort(np.arctan2(*(axes[:2] @ (centers - middle).T)))
-        gap = np.degrees(np.diff(np.append(around, around[0] + 2 * np.pi)).max())
-        if gap > GAP:
+        if (gap := np.degrees(np.diff(np.append(around, around[0] + 2 * np.pi)).max())) > GAP:
             yield Finding("coverage", "note", f"nobody photographed from {gap:.0f} of the 360 degrees around.")
 
 
@@ -202,6 +201,5 @@ CHECKS = (check_reprojection, check_coverage, check_sky, check_axes, check_expos
 
 def worst_and_best(subject: Subject, photos: list[Photo], count: int) -> list[Photo]:
     """Photos to look at: the worst half by reprojection error, the rest evenly from the others."""
-    medians = subject.medians
-    ranked = sorted(photos, key=lambda photo: -medians.get(photo.name, 0.0))
+    ranked = sorted(photos, key=lambda photo: -subject.medians.get(photo.name, 0.0))
     return ranked[: count // 2] + sample(ranked[count // 2 :], count - count // 2)

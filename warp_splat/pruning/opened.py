@@ -40,6 +40,7 @@ class Opened(Finished):
         super().__init__(config.model, config.iteration, config.crop)
         require_some(self)
         self.scene = self.refined(self.load_scene(config.source_path, print))
+        self.refuse_trained(self.scene)
         if config.crop:
             train, test = (self._within(views, used) for views in (self.scene.train, self.scene.test))
             if not train:

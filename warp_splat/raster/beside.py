@@ -125,8 +125,7 @@ def normals_of(gaussians: Gaussians, away: torch.Tensor) -> torch.Tensor:
     Differentiable in the quaternions.
     """
     axes = rotations(gaussians.quats).mT
-    shortest = gaussians.scales.detach().argmin(1)
-    normals = axes.gather(1, shortest[:, None, None].expand(-1, 1, 3)).squeeze(1)
+    normals = axes.gather(1, gaussians.scales.detach().argmin(1)[:, None, None].expand(-1, 1, 3)).squeeze(1)
     return torch.where((normals.detach() * away).sum(1, keepdim=True) > 0, -normals, normals)
 
 

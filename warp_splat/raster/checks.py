@@ -231,8 +231,7 @@ def _dense(tensor: torch.Tensor) -> torch.Tensor:
 def _check_finite(name: str, tensor: torch.Tensor) -> None:
     if bool(tensor.sum().isfinite()):  # then all are; a test of each takes many times as long
         return
-    bad = ~torch.isfinite(tensor)
-    if bool(bad.any()):
+    if bool((bad := ~torch.isfinite(tensor)).any()):
         raise InputError(
             f"{name}: expected finite numbers, got {int(bad.sum())} that are NaN or infinite, the first in Gaussian "
             f"{int(bad.nonzero()[0, 0])}; remove those Gaussians."

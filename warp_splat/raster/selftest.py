@@ -51,8 +51,7 @@ def settle_device(
     Raises:
         InputError: if a GPU was asked for by name and cannot be used, or fails.
     """
-    device = prepare(requested, threads)
-    if device.type == "cpu":
+    if (device := prepare(requested, threads)).type == "cpu":
         return device
     say("Testing the GPU; its kernels are compiled once on a machine ...")
     try:

@@ -104,6 +104,8 @@ def render_model(config: RenderConfig) -> int:
     given = scene = None
     if _needs_scene(config):
         given = finished.load_scene(config.source_path, say)
+        if not config.skip_test:
+            finished.refuse_trained(given)
         if (scene := finished.refined(given)) is not given:
             say("The cameras are those of the model, which were refined with it.")
     options = replace(finished.options, of=config.of, tolerance=config.tolerance or None)
@@ -227,8 +229,7 @@ def _film(picture: Callable[[Camera], np.ndarray], cameras: list[Camera], output
         folder = model_folder.prepare_folder(output)
         for index, frame in enumerate(frames):
             save_png(folder / f"{index:05d}.png", frame)
-        older = len(list(folder.glob("[0-9]" * 5 + ".png"))) - len(cameras)
-        if older > 0:
+        if (older := len(list(folder.glob("[0-9]" * 5 + ".png"))) - len(cameras)) > 0:
             print(f"Warning: {older} older frames are in {folder}, too.")
     else:
         for _ in frames:

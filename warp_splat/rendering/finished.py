@@ -14,7 +14,7 @@ from warp_splat.config import RasterOptions
 from warp_splat.errors import InputError
 from warp_splat.formats.coordinates import read_coordinates
 from warp_splat.formats.exposures import Exposures, read_exposures
-from warp_splat.formats.model_folder import folder_of, open_model, read_environment, read_refined
+from warp_splat.formats.model_folder import folder_of, open_model, read_environment, read_refined, trained_names
 from warp_splat.formats.splats import SplatFile
 from warp_splat.gaussians import GaussianModel
 from warp_splat.raster.api import RenderOutput
@@ -117,6 +117,15 @@ class Finished:
         scene = load_scene(source, **names, resolution=resolution, **flags, memory=photo_memory(), report=say)
         scene.refuse_other_origin(self.path, self.placed().coordinates)
         return scene
+
+    def refuse_trained(self, scene: Scene) -> None:
+        """Raise InputError if a photograph that is held out now was trained on: the scene has changed since."""
+        trained = trained_names(self.path)
+        if found := [view.name for view in scene.test if view.name in trained]:
+            raise InputError(
+                f"{self.path}: expected to test on photographs that were held out, found {len(found)} that were "
+                f"trained on, such as {found[0]}; name the scene of then with -s."
+            )
 
     def refined(self, scene: Scene) -> Scene:
         """The scene with the cameras that were learned with the Gaussians; itself, if they were not.

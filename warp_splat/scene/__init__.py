@@ -227,8 +227,7 @@ def too_far(photos: list[Photo]) -> str:
 
 def too_near(photos: list[Photo], points: np.ndarray) -> str:
     """What to tell the user if ``points`` [P, 3] come as near to the cameras as what is never drawn; else nothing."""
-    near = nearest_shown([photo.camera for photo in photos], points)
-    if near >= 2 * NEAR:
+    if (near := nearest_shown([photo.camera for photo in photos], points)) >= 2 * NEAR:
         return ""
     return (
         f"in half of the images the nearest points are nearer than {near:.2g}, and what is nearer than {NEAR} is never "

@@ -10,6 +10,7 @@ import numpy as np
 
 from warp_splat.errors import InputError
 from warp_splat.formats.files import Unexpected, json_object, reading
+from warp_splat.scene import takes_colmap
 from warp_splat.scene.images import read_numbers, same_shape
 from warp_splat.scene.types import Scene, View
 
@@ -28,8 +29,9 @@ class Fit(NamedTuple):
 def read_inverse_depths(scene: Scene, folder: str) -> dict[View, np.ndarray]:
     """1 / depth of the training views, each [H, W] float32 as its photograph, negative where it is not known.
 
-    Of PNG, a number counts 1 / 65536; both kinds are taken times ``scale`` plus ``offset`` of PARAMETERS, which EXR can
-    do without. Maps whose scale lies far from the median are left out.
+    Of PNG, a number counts 1 / 65536; both kinds are taken times ``scale`` plus ``offset`` of PARAMETERS (without a
+    COLMAP model: in the scene's folder), which EXR can do without. Maps whose scale lies far from the median are left
+    out.
 
     Args:
         scene: as it was loaded.
@@ -40,8 +42,9 @@ def read_inverse_depths(scene: Scene, folder: str) -> dict[View, np.ndarray]:
             nothing.
     """
     source = scene.source or Path()
+    parameters = source / (PARAMETERS if takes_colmap(source) else Path(PARAMETERS).name)
     paths = {view: _find(source / folder, view) for view in scene.train}
-    fits = _read_fits(source / PARAMETERS, [Path(v.name).with_suffix("").as_posix() for v in scene.train], paths)
+    fits = _read_fits(parameters, [Path(v.name).with_suffix("").as_posix() for v in scene.train], paths)
     median = float(np.median([fit.scale for fit in fits if fit.scale > 0] or [1.0]))
     low, high = (share * median for share in NEAR_MEDIAN)
     chosen = zip(paths.items(), fits, strict=True)

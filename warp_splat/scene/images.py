@@ -187,8 +187,7 @@ def read_numbers(path: Path) -> np.ndarray:
         InputError: if it has neither, or is not an image that OpenImageIO reads.
     """
     file = _open(path)
-    kind = file.spec().format
-    if kind.basetype not in (*FLOATS, oiio.BASETYPE.UINT16):
+    if (kind := file.spec().format).basetype not in (*FLOATS, oiio.BASETYPE.UINT16):
         raise InputError(f"{path}: expected numbers of 16 bits or floats, found {kind}; save it as 16-bit PNG or EXR.")
     numbers = _decoded(path, file, 0, 0, 0, 1, oiio.FLOAT if kind.basetype in FLOATS else oiio.UINT16)
     return numbers[..., 0] / (1.0 if kind.basetype in FLOATS else 2.0**16)

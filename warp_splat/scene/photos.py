@@ -73,8 +73,8 @@ class ImageFinder:
         if self.has(path):
             return self.root / path
         files = self._files(path.parent)
-        alike = [file for file in (f"{path.name}{ending}" for ending in PHOTOS) if file in files][:1]  # no ending given
-        alike = alike or sorted(
+        whole = (f"{path.name}{ending}" for ending in (".png", *PHOTOS))  # where no ending is given
+        alike = [file for file in whole if file in files][:1] or sorted(
             file for file in files if Path(file).stem == path.stem and file.lower().endswith(READABLE)
         )
         if len(alike) > 1:

@@ -109,8 +109,7 @@ def _split(
     train, val, test = (_names(content, f"{key}_filenames", path) for key in ("train", "val", "test"))
     held_out = test or val
     to_train = train or {*names} - held_out
-    odd = ((to_train | held_out) - {*names}) | (to_train & held_out)
-    if odd or not to_train:
+    if (odd := ((to_train | held_out) - {*names}) | (to_train & held_out)) or not to_train:
         problem = f"{min(odd)!r:.200} has no frame or is in two" if odd else "none is left to train on"
         raise InputError(f"{path}: expected lists of names that part the frames, but {problem}; correct the file.")
     if unused := len({*names} - to_train - held_out):
@@ -155,14 +154,19 @@ def _lens(values: dict[str, Any], size: tuple[int, int], where: str) -> Calibrat
         raise InputError(f"{where}: expected w and h as numbers of pixels, got {width} and {height}; correct the file.")
     if values.get("camera_model") == PANORAMA:
         return Calibration(PANORAMA, int(width), int(height), (width, height))
-    if "fl_x" in values:
-        fx = number("fl_x")
-    else:
-        angle = _value(values, "camera_angle_x", where, "fl_x or camera_angle_x")
-        if not 0 < number("camera_angle_x") < np.pi:
-            raise _wrong(where, "camera_angle_x between 0 and pi", angle)
-        fx = 0.5 * width / np.tan(0.5 * angle)
-    focal = (fx, number("fl_y", fx), number("cx", width / 2), number("cy", height / 2))
+
+    def focal_of(axis: str, side: float) -> float:
+        known, key = f"fl_{axis}", f"camera_angle_{axis}"
+        if known in values:
+            return number(known)
+        angle = _value(values, key, where, f"{known} or {key}")
+        if not 0 < number(key) < np.pi:
+            raise _wrong(where, f"{key} between 0 and pi", angle)
+        return 0.5 * side / np.tan(0.5 * angle)
+
+    fx = focal_of("x", width)
+    fy = focal_of("y", height) if "fl_y" in values or ("fl_x" not in values and "camera_angle_y" in values) else fx
+    focal = (fx, fy, number("cx", width / 2), number("cy", height / 2))
     k1, k2, k3, k4, p1, p2 = (number(key) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
     model = values.get("camera_model", FISHEYE if values.get("is_fisheye") is True else "OPENCV")
     if model == FISHEYE and not (p1 or p2):

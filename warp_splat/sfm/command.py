@@ -173,8 +173,7 @@ def _frames(video: Path, work: Path, config: SfmConfig, say) -> Path:
 def _reconstruct(root: Path, names: list[str], scene: Path, work: Path, config: SfmConfig, say) -> dict[str, Any]:
     """All stages, the largest model as the scene; returns what there is to say of it."""
     groups, broken = _groups(root, names, config.threads, say)
-    names = [name for group in groups for name in group]
-    if len(names) < LEAST:
+    if len(names := [name for group in groups for name in group]) < LEAST:
         raise InputError(f"{root}: expected at least {LEAST} readable photographs, found {len(names)}; add some.")
     lenses = f"{len(groups)} lens{'es' * (len(groups) > 1)}"
     say(f"{len(names)} photographs, {lenses}, {config.threads} threads; work in {work}")

@@ -149,8 +149,7 @@ def leave_out_doubtful(database: Path) -> None:
     fits = csr_array((np.ones(sure.sum(), int), ends[:, sure]), (len(numbers), len(numbers)))
     fits += fits.T
     _, parts = connected_components(fits)
-    thirds = (fits[ends[0]] * fits[ends[1]]).sum(axis=1)
-    doubtful = ~sure & (thirds == 0) & (parts[ends[0]] == parts[ends[1]])
+    doubtful = ~sure & ((fits[ends[0]] * fits[ends[1]]).sum(axis=1) == 0) & (parts[ends[0]] == parts[ends[1]])
     with opened(database) as connection:
         for pair in numbers[ends[:, doubtful]].T.tolist():
             connection.delete_two_view_geometry(*pair)

@@ -36,6 +36,7 @@ For what is shown and saved, a part may have:
 
 Both may have, the growth after the parts:
 
+    told() -> sentences                     what is said before the first step
     load()                                  compile and load the kernels that they launch, before the first step
     asks(options, step) -> options          what they need of the renderer in this step: depth, ...
     loss(loss, out, step) -> loss           a scalar, which is differentiated

@@ -94,7 +94,7 @@ class Trainer:
         folder = self._folder() if config.machine.out_of_core else None
         self.optimizer = Optimizer(self.model, config.learn, scene.extent, processes.images, groups, folder)
         self.growth = GROWTHS[growth].load()(config.plugins[growth], setting, self.optimizer)
-        self.told = [sentence for told in having([self.growth], "told") for sentence in told()]
+        self.told = [sentence for told in having([*self.parts, self.growth], "told") for sentence in told()]
         self.dropped: Counter = Counter()  # of NOT_FINITE, on the device; prunings that would have emptied the scene
         self.options = RasterOptions(antialiasing=config.model.antialiasing, projection=config.model.projection)
         self.degree = min(COEFFICIENTS.index(scene.start.splats.sh.shape[1]), degree) if scene.start else 0

@@ -59,7 +59,8 @@ class Budget(Reference):
         if most < self.start or -(-following // step) * step >= self.end:
             return most
         share = math.sqrt((iteration - options.densify_from_iter) / (self.end - options.densify_from_iter))
-        return self.start + round((most - self.start) * share)
+        now = self.processes.total(len(self.model))  # no fewer, where a later end was given since
+        return max(self.start + round((most - self.start) * share), min(now, most))
 
     def _grow(self, due: int) -> Change | None:
         self.processes.merge(self.gradient)

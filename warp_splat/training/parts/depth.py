@@ -52,6 +52,11 @@ class Depth:
             )
         self._found: dict[View, tuple[torch.Size, list[Target]]] = {}
 
+    def told(self) -> list[str]:
+        """Whether maps did not fit."""
+        out = len(self.points) - len(self.maps) if self.maps else 0
+        return [f"{out} of {len(self.points)} depth maps are left out, of scales far from the median."] * bool(out)
+
     @classmethod
     def needed(cls, scene: Scene) -> Verdict:
         """If few photographs show the same: then they do not tell depth well, and points do."""

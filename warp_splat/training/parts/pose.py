@@ -185,8 +185,7 @@ def orthonormal(vectors: np.ndarray) -> list[np.ndarray]:
         rest = vector
         for other in basis:
             rest = rest - dot(rest, other) * other
-        length = math.sqrt(dot(rest, rest))
-        if length > FLAT * math.sqrt(dot(vector, vector)):
+        if (length := math.sqrt(dot(rest, rest))) > FLAT * math.sqrt(dot(vector, vector)):
             basis.append(rest / length)
     return basis
 
