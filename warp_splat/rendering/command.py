@@ -104,7 +104,7 @@ def render_model(config: RenderConfig) -> int:
     given = scene = None
     if _needs_scene(config):
         given = finished.load_scene(config.source_path, say)
-        if not config.skip_test:
+        if not (config.skip_test or config.video or config.orbit):
             finished.refuse_trained(given)
         if (scene := finished.refined(given)) is not given:
             say("The cameras are those of the model, which were refined with it.")
