@@ -7,6 +7,7 @@ import tomllib
 import numpy as np
 import pytest
 from commands import SCENE
+from hostile import refusal
 from trainings import begin, state_of, stepped, steps
 
 from warp_splat.cli import main, parse
@@ -254,6 +255,13 @@ def test_a_whole_training_by_the_clock_is_repeated_by_its_options(tmp_path, caps
     assert a == b
     first, again = (json.loads((tmp_path / name / "history.json").read_text()) for name in "ab")
     assert [{**record, "seconds": 0} for record in first] == [{**record, "seconds": 0} for record in again]
+
+
+def test_a_shape_has_to_fit_its_iterations(scene):
+    """As a file that names but a part of it may have: nothing would grow, and no end come."""
+    for shape in ({"coarse": 4, "coarse_until_iter": 51}, {"cooldown": 51}):
+        config = TrainConfig(device="cpu", minutes=1.0, iterations=50, **shape)
+        refusal(lambda: plan_training(scene, config, ALONE, str), "within its 50 iterations")  # noqa: B023
 
 
 def test_a_densification_has_to_fit(scene):

@@ -252,7 +252,7 @@ def test_render_says_that_the_scene_is_another(told, tmp_path, capsys):
         assert (f"the model was trained on {SCENE}" in capsys.readouterr().out) == said
 
 
-def test_photographs_that_were_trained_on_test_nothing(told, tmp_path, fails):
+def test_photographs_that_were_trained_on_test_nothing(told, tmp_path, fails, capsys):
     """One photograph less, and every eighth is another; what was measured stays."""
     scene, before = shutil.copytree(SCENE, tmp_path / "scene"), (told / "results.json").read_bytes()
     model = pycolmap.Reconstruction(scene / "sparse" / "0")
@@ -260,7 +260,12 @@ def test_photographs_that_were_trained_on_test_nothing(told, tmp_path, fails):
     model.write(scene / "sparse" / "0")
     words = "render", "-m", told, "-s", scene, "--quiet"
     assert "found 7 that were trained on, such as view_001.png; name the scene of then" in fails(*words)
-    assert "trained on" in fails("simplify", told, "-s", scene, "--keep", "0.5", "-o", tmp_path / "a.ply")
+    capsys.readouterr()
+    assert main([*map(str, ("simplify", told, "-s", scene, "--keep", "0.5", "-o", tmp_path / "a.ply"))]) == 0
+    assert "7 photographs that would be held out now, such as view_001.png, were trained on" in capsys.readouterr().out
+    start = "train", "-s", scene, "-m", tmp_path / "new", "--start_ply", told, *SHORT, "--iterations", "1"
+    assert main([*map(str, start)]) == 0
+    assert f"Warning: {told} was trained on 7 of 7 images that are held out." in capsys.readouterr().out
     for more in (["--skip_test"], ["--video", "orbit", "--frames", "2", "--video_output", str(tmp_path / "a.mp4")]):
         assert main([*map(str, words), *more]) == 0
     assert (told / "results.json").read_bytes() == before

@@ -95,8 +95,7 @@ def rasterize(
             that is not drawn.
     """
     given: dict[str, Any] = {"means": means, "quats": quats, "scales": scales, "opacities": opacities}
-    pair = isinstance(sh, (tuple, list)) and len(sh) == 2
-    given |= {"sh[0]": sh[0], "sh[1]": sh[1]} if pair else {"sh": sh}
+    given |= {"sh[0]": sh[0], "sh[1]": sh[1]} if isinstance(sh, (tuple, list)) and len(sh) == 2 else {"sh": sh}
     given |= {"background": background} if isinstance(background, wp.array) else {}
     more = {"twist": twist, "intrinsics": intrinsics, "features": features}
     given |= {name: array for name, array in more.items() if array is not None}

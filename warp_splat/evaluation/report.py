@@ -162,8 +162,7 @@ def _difference(photo: np.ndarray, render: np.ndarray) -> np.ndarray:
     """[H, W] uint8: mean absolute difference of the channels, amplified and cut at white."""
     if photo.shape != render.shape:
         raise InputError(f"rows: expected a render of shape {photo.shape}, got {render.shape}.")
-    difference = np.abs(photo.astype(np.float64) - render).mean(axis=2)
-    return np.minimum(DIFFERENCE_GAIN * difference, 255).astype(np.uint8)
+    return np.minimum(DIFFERENCE_GAIN * np.abs(photo.astype(np.float64) - render).mean(axis=2), 255).astype(np.uint8)
 
 
 def _smooth(values: np.ndarray) -> np.ndarray:

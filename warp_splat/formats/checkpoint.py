@@ -177,8 +177,7 @@ def _facts(file: Any) -> tuple[str, dict[str, Any]]:
     if (text := (file.metadata() or {}).get("warp_splat")) is None:
         raise Unexpected("other safetensors")
     facts = json.loads(text)
-    found = facts.get("format") if isinstance(facts, dict) else None
-    if type(found) is not int:
+    if type(found := facts.get("format") if isinstance(facts, dict) else None) is not int:
         raise Unexpected("one without a format number")
     if found > FORMAT:
         raise Unexpected(f"one of format {found!r:.20} (this program knows up to {FORMAT}); install a newer version")

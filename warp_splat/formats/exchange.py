@@ -86,8 +86,7 @@ def save_gaussians(path: str | Path, file: SplatFile, report: Report = print) ->
             cannot say so, or the file cannot be written.
     """
     check_shapes(file.splats)
-    form = format_of(path)
-    if not (form.empty or len(file.splats.means)):
+    if not ((form := format_of(path)).empty or len(file.splats.means)):
         raise InputError(f"{path}: there are no Gaussians, and such a file cannot say so; choose another format.")
     if form.along_curve:
         from warp_splat.formats.curve import arranged  # noqa: PLC0415 - torch takes seconds to load

@@ -173,8 +173,7 @@ def check_expansion(count: int, bytes_each: int, file_bytes: int) -> None:
         bytes_each: of each before compression.
         file_bytes: of the file.
     """
-    limit = max(SMALLEST_LIMIT, LARGEST_RATIO * file_bytes)
-    if count * bytes_each > limit:
+    if count * bytes_each > (limit := max(SMALLEST_LIMIT, LARGEST_RATIO * file_bytes)):
         raise ValueError(f"{count} Gaussians expand to {count * bytes_each} bytes, over {limit}")
 
 

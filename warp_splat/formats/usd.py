@@ -80,8 +80,7 @@ def save_usd(path: str | Path, file: SplatFile, report: Report = print) -> None:
             layer.customLayerData = {COORDINATES: json.dumps(coordinates)}
         package = temporary.suffix.lower() == ".usdz"
         inner = f"{folder}/gaussians.usdc" if package else str(temporary)
-        written = layer.Export(inner)
-        if written and package:
+        if (written := layer.Export(inner)) and package:
             os.utime(inner, 2 * (time.mktime(PACKED_AT),))
             # it does not tell when the end is missing
             written = UsdUtils.CreateNewUsdzPackage(inner, str(temporary)) and is_zipfile(temporary)

@@ -40,7 +40,11 @@ class Opened(Finished):
         super().__init__(config.model, config.iteration, config.crop)
         require_some(self)
         self.scene = self.refined(self.load_scene(config.source_path, print))
-        self.refuse_trained(self.scene)
+        if found := self.trained_among(self.scene):
+            print(
+                f"{len(found)} photographs that would be held out now, such as {found[0]}, were trained on: not used."
+            )
+            self.scene = replace(self.scene, test=[view for view in self.scene.test if view.name not in found])
         if config.crop:
             train, test = (self._within(views, used) for views in (self.scene.train, self.scene.test))
             if not train:

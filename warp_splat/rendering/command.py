@@ -104,8 +104,11 @@ def render_model(config: RenderConfig) -> int:
     given = scene = None
     if _needs_scene(config):
         given = finished.load_scene(config.source_path, say)
-        if not (config.skip_test or config.video or config.orbit):
-            finished.refuse_trained(given)
+        if not (config.skip_test or config.video or config.orbit) and (found := finished.trained_among(given)):
+            raise InputError(
+                f"{config.model_path}: expected to test on photographs that were held out, found {len(found)} that "
+                f"were trained on, such as {found[0]}; name the scene of then with -s, or use --skip_test."
+            )
         if (scene := finished.refined(given)) is not given:
             say("The cameras are those of the model, which were refined with it.")
     options = replace(finished.options, of=config.of, tolerance=config.tolerance or None)

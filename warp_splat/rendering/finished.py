@@ -118,14 +118,10 @@ class Finished:
         scene.refuse_other_origin(self.path, self.placed().coordinates)
         return scene
 
-    def refuse_trained(self, scene: Scene) -> None:
-        """Raise InputError if a photograph that is held out now was trained on: the scene has changed since."""
+    def trained_among(self, scene: Scene) -> list[str]:
+        """Photographs that are held out now and were trained on, as the scene has changed since: mostly none."""
         trained = trained_names(self.path)
-        if found := [view.name for view in scene.test if view.name in trained]:
-            raise InputError(
-                f"{self.path}: expected to test on photographs that were held out, found {len(found)} that were "
-                f"trained on, such as {found[0]}; name the scene of then with -s."
-            )
+        return [view.name for view in scene.test if view.name in trained]
 
     def refined(self, scene: Scene) -> Scene:
         """The scene with the cameras that were learned with the Gaussians; itself, if they were not.

@@ -72,9 +72,13 @@ def plan_training(scene: Scene, config: TrainConfig, processes: Processes, say: 
     """The options that a training of ``config.learn.minutes`` begins with: measured, planned, and told.
 
     Raises:
-        InputError: if there is too little time for one change of the set of Gaussians.
+        InputError: if there is too little time for one change of the set of Gaussians, or the schedule does not fit.
     """
-    minutes = config.learn.minutes
+    minutes, learn = config.learn.minutes, config.learn
+    if (late := max(learn.coarse_until_iter * (learn.coarse > 1), learn.cooldown)) > learn.iterations:
+        raise InputError(
+            f"--minutes: expected a file's schedule within its {learn.iterations} iterations, got {late}; name all."
+        )
     say("Measuring this machine (kernels are compiled first, once on a machine, about 20 s) ...")
     measured_as = suggested(config, scene).changed(settle_from_iter=1, minutes=0.0)  # its set stays as it is
     trial = Trainer(scene, measured_as, processes)

@@ -76,8 +76,7 @@ def describe(trainer: "Trainer") -> tuple[str, bool]:
     if not limit:
         text += f", {(step(10**6) - step(0)) / GIB:.1f} GiB more for each further million"
     available = available_memory(torch.device("cpu"))
-    fits = processes * needed <= available
-    if not fits:
+    if not (fits := processes * needed <= available):
         text += (
             f". Only {(base + available // processes) / GIB:.1f} GiB can be had: take smaller images (-r) or fewer "
             "Gaussians (--max_gaussians)"

@@ -121,8 +121,7 @@ def nan_upstream(mode: str) -> Outcome:
             upstream[which][9, 7] = value
             out, gradients = _gradients(upstream, mode)
             results.append(gradients)
-            expected = int(value != 0.0)
-            if out.dropped.pixels != expected:
+            if out.dropped.pixels != (expected := int(value != 0.0)):
                 failures.append(f"dropped {out.dropped.pixels} pixels, not {expected}")
             dropped += out.dropped.pixels
         for name, value in results[0].items():
