@@ -139,7 +139,7 @@ def open_scene(config: TrainConfig, begun: Checkpoint | None, say: Say, processe
     memory = photo_memory(config.machine.photo_memory, processes)
     scene = load_scene(data.source_path, **same, start=start, memory=memory, report=say)
     scene.refuse_other_origin(data.start_ply, scene.start and scene.start.coordinates)
-    known = model_folder.trained_names(data.start_ply) if scene.start and not begun else ()
+    known = model_folder.trained_names(data.start_ply) if scene.start and scene.test and not begun else ()
     if found := [view.name for view in scene.test if view.name in known]:
         say(f"Warning: {data.start_ply} was trained on {len(found)} of {len(scene.test)} images that are held out.")
     scene.refuse_other_origin(begun and begun.path, begun and read_coordinates(begun.path.parent))
