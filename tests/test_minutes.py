@@ -261,7 +261,7 @@ def test_a_shape_has_to_fit_its_iterations(scene):
     """As a file that names but a part of it may have: nothing would grow, and no end come."""
     for shape in ({"coarse": 4, "coarse_until_iter": 51}, {"cooldown": 51}):
         config = TrainConfig(device="cpu", minutes=1.0, iterations=50, **shape)
-        refusal(lambda: plan_training(scene, config, ALONE, str), "cooldown within 50 iterations, got 51")  # noqa: B023
+        refusal(lambda: plan_training(scene, config, ALONE, str), "cooldown in 50 iterations, got 51")  # noqa: B023
 
 
 def test_a_densification_has_to_fit(scene):

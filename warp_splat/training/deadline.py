@@ -77,7 +77,7 @@ def plan_training(scene: Scene, config: TrainConfig, processes: Processes, say: 
     minutes, learn = config.learn.minutes, config.learn
     if (late := max(learn.coarse_until_iter * (learn.coarse > 1), learn.cooldown)) > learn.iterations:
         raise InputError(
-            f"--minutes: expected coarse_until_iter, cooldown within {learn.iterations} iterations, got {late}; lower it."
+            f"--minutes: expected coarse_until_iter, cooldown in {learn.iterations} iterations, got {late}; lower it."
         )
     say("Measuring this machine (kernels are compiled first, once on a machine, about 20 s) ...")
     measured_as = suggested(config, scene).changed(settle_from_iter=1, minutes=0.0)  # its set stays as it is
