@@ -12,6 +12,7 @@ from scene_files import LENS, texture, write_image
 from warp_splat.camera import Camera
 from warp_splat.cli import main
 from warp_splat.formats.checkpoint import LAST
+from warp_splat.formats.coordinates import write_coordinates
 from warp_splat.formats.exchange import load_gaussians, save_gaussians
 from warp_splat.formats.model_folder import ply_path
 from warp_splat.formats.ply import save_points
@@ -119,6 +120,7 @@ WRONG = {
     "expected the number of blocks of": ((0, 1), spoil('"cells": [', '"cells": [[[0, 0, 0], [1, 1, 1]], ')),
     "expected the cells of": ((0, 1), spoil("3.4", "3.1")),
     "expected the antialiasing of": ((0, 1), spoil("antialiasing=False", "antialiasing=True", "cfg_args")),
+    "expected the origin of": ((0, 1), lambda folder: write_coordinates(folder / "1", {"origin": [1.0, 2.0, 3.0]})),
     "cfg_args: could not be read (No such file or directory)": (
         (0, 1),
         lambda folder: (folder / "1" / "cfg_args").unlink(),

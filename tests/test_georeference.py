@@ -231,6 +231,9 @@ def test_gaussians_from_another_origin_are_refused(tmp_path, fails):
     assert said in fails("render", "-m", model) and said in fails("train", "--resume", model, "--iterations", "2")
     assert said in fails("train", "-s", scene, "-m", tmp_path / "new", "--start_ply", model)
     assert read_coordinates(model) == here
+    write_coordinates(scene, None)
+    assert main(["train", "--resume", str(model), "--iterations", "2"]) == 0
+    assert read_coordinates(model) == here
 
 
 def test_damaged_coordinates_get_one_sentence(tmp_path):

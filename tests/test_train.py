@@ -72,6 +72,9 @@ def test_render_repeats_the_pictures_of_training(trained, capsys):
     assert main(["render", "-m", str(trained), "--iteration", "40", "--skip_train", "--quiet"]) == 0
     assert json.loads((trained / "results.json").read_text())["ours_60"]["seconds"] > 0  # what training said stays
     assert set(json.loads((trained / "results.json").read_text())) == {"ours_40", "ours_60"}
+    capsys.readouterr()
+    assert main(["render", "-m", str(trained), "--skip_train", "--skip_test", "--quiet"]) == 0
+    assert capsys.readouterr().out == "Nothing to draw: 43 images to train on, 7 held out.\n"
 
 
 @pytest.mark.slow

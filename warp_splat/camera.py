@@ -89,12 +89,11 @@ class Camera:
                     f"Camera lens {self.lens.model}: expected a picture of 2:1, got {self.width} x {self.height} "
                     "pixels; use one that shows all around."
                 )
-        if self.shutter is not None:
-            if (share := abs(self.shutter.turn[0]) * self.fy / self.height) > MOST_SHARE:
-                raise InputError(
-                    "Camera shutter: expected a turn that moves the picture up or down by at most half of its "
-                    f"height while it is read, got {share:.2f}; check fy and the poses."
-                )
+        if self.shutter and (share := abs(self.shutter.turn[0]) * self.fy / self.height) > MOST_SHARE:
+            raise InputError(
+                "Camera shutter: expected a turn that moves the picture up or down by at most half of its height "
+                f"while it is read, got {share:.2f}; check fy and the poses."
+            )
 
     @classmethod
     def rolling(cls, first: Camera, last: Camera) -> Camera:

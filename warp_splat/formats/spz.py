@@ -73,10 +73,9 @@ def save_spz(path: str | Path, file: SplatFile, report: Report = print) -> None:
         # all eight bits: the authors keep five and four, for 3/5 of the size; the images differ ten decibels more then
         _bytes(128 * clipped("harmonics", sh[:, 1:], -1.0, 127 / 128, report) + 128),
     ]
-    with atomic_write(path) as temporary, open(temporary, "wb") as raw:
-        # no time and no name in the header: equal Gaussians give equal bytes
-        with gzip.GzipFile("", "wb", 6, raw, mtime=0) as target:
-            target.write(b"".join(payload))
+    # no time and no name in the header: equal Gaussians give equal bytes
+    with atomic_write(path) as new, open(new, "wb") as raw, gzip.GzipFile("", "wb", 6, raw, mtime=0) as target:
+        target.write(b"".join(payload))
 
 
 def load_spz(path: str | Path, report: Report = print) -> SplatFile:

@@ -127,21 +127,22 @@ def render_model(config: RenderConfig) -> int:
         elif scene:
             for sentence in absent:
                 say(sentence)
-            if scene.train and not config.skip_train:
+            train, test = [] if config.skip_train else scene.train, [] if config.skip_test else scene.test
+            if not (train or test):
+                print(f"Nothing to draw: {len(scene.train)} images to train on, {len(scene.test)} held out.")
+            if train:
                 written = folder / "train" / f"ours_{iteration}"
-                for _ in write_views(picture, scene.train, written):
-                    pass
-                print(f"  train  {len(scene.train)} views in {written}")
-                certify(scene.train, written)
-            if scene.test and not config.skip_test:
+                count = sum(1 for _ in write_views(picture, train, written))
+                print(f"  train  {count} views in {written}")
+                certify(train, written)
+            if test:
                 extra = {"split": "test", "gaussians": len(model)}
-                where = None
-                if scene is not given:
-                    where = where_taken(model.activated(), finished.background(device), options, given.extent)
-                means, compared = evaluate_views(picture, scene.test, folder, "test", iteration, extra, metrics, where)
+                seen = model.activated(), finished.background(device), options, given.extent
+                where = where_taken(*seen) if scene is not given else None
+                means, compared = evaluate_views(picture, test, folder, "test", iteration, extra, metrics, where)
                 show_views(compared, folder, "test", iteration, say)
-                print(f"  test   {len(scene.test)} views in {folder / 'test' / f'ours_{iteration}'}")
-                certify(scene.test, folder / "test" / f"ours_{iteration}")
+                print(f"  test   {len(test)} views in {folder / 'test' / f'ours_{iteration}'}")
+                certify(test, folder / "test" / f"ours_{iteration}")
                 print(f"  {metrics_line(means)}: {folder / 'results.json'}, pictures in {folder / 'contact_sheet.png'}")
     return 0
 

@@ -120,7 +120,8 @@ def merge_blocks(config: MergeConfig) -> int:
     models = [open_model(place)[:2] for place in places]
     trained, kinds = [read_cfg_args(place) for place in places], []
     for place, block, options in zip(places, blocks, trained, strict=True):
-        cells = {"number of blocks": len(block.cells), "cells": block.cells.tolist()}
+        origin = (read_coordinates(place) or {}).get("origin")
+        cells = {"number of blocks": len(block.cells), "cells": block.cells.tolist(), "origin": origin}
         kinds.append({**cells, **{name: options.get(name) for name in COMMON}})
         if other := [name for name, value in kinds[-1].items() if value != kinds[0][name]]:
             raise InputError(f"{place}: expected the {other[0]} of {places[0]}, found another; move one of them away.")

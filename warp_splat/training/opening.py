@@ -162,7 +162,7 @@ def write_inputs(folder: Path, config: TrainConfig, scene: Scene, continues: boo
     model_folder.write_cfg_args(folder, {**config.flat(), "train_test_exp": False, "linear_light": scene.linear})
     write_config(folder, config)
     model_folder.write_cameras(folder, scene.test, scene.train, scene.coordinates)
-    write_coordinates(folder, scene.coordinates)
+    write_coordinates(folder, scene.coordinates or (read_coordinates(folder) if continues else None))
     remove_leftovers(folder)
     (folder / BLOCK).unlink(missing_ok=True)  # until this, too, has ended
     if not (continues and (folder / "input.ply").exists()):
