@@ -216,8 +216,8 @@ def test_convert_says_what_is_lost(tmp_path, capsys):
         ("a.ply", "b", "found 'no ending'"),
         ("none.spz", "b.ply", "none.spz: no such file"),
         ("a.spz", "b.ply", "a.spz: expected an SPZ file of version 2, 3 or 4, found a file that begins with b'ply"),
-        ("a.ply", "a.ply", "expected another file than the source"),
-        (".", "point_cloud/iteration_7/point_cloud.ply", "expected another file than the source"),
+        ("a.ply", "a.ply", "expected another file than the model"),
+        (".", "point_cloud/iteration_7/point_cloud.ply", "expected another file than the model"),
         *(("empty.ply", target, "there are no Gaussians") for target in ("b.splat", "b.glb", "b.sog")),
     ],
 )

@@ -287,6 +287,8 @@ def test_nothing_lies_outside_of_a_crop(model, scene, tmp_path, options):
     assert main(["mesh", str(model[0]), str(output), "-s", scene, "--voxel", "0.04", *options, "--crop", *box]) == 0
     vertices = trimesh.load(output, force="mesh").vertices * [-1, -1, 1]
     assert (vertices >= low - 1e-6).all() and (vertices <= high + 1e-6).all() and len(vertices) > 50
+    inner = ((vertices > low + 0.05) & (vertices < high - 0.05)).all(1)  # through the cut, cameras look at its back
+    assert np.abs(np.linalg.norm(vertices[inner] - model[2], axis=1) - model[1]).max() < 0.05
 
 
 def test_fewer_triangles_than_there_can_be(model, scene, tmp_path, capsys):
@@ -311,6 +313,7 @@ def test_convex_pieces(model, scene, tmp_path, ending):
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
+        (["link.ply"], "link.ply: expected another file than the model"),
         (["ball.stl"], "expected a name that ends in .ply, .glb, .obj"),
         (["file/ball.ply"], "expected a folder that can be written"),
         (["ball.ply", "--collision", "9999999999999999999"], "--collision: expected 0 to 1000000"),
@@ -328,6 +331,7 @@ def test_sentences(model, scene, capsys, monkeypatch, tmp_path, arguments, said)
     monkeypatch.chdir(tmp_path)
     (tmp_path / "ball_collision.ply").mkdir()
     (tmp_path / "file").touch()
+    (tmp_path / "link.ply").symlink_to(model[0])
     monkeypatch.delattr("warp_splat.meshing.command.filled")  # said before photographs are compared, which takes long
     assert main(["mesh", str(model[0]), *arguments, "-s", scene]) != 0
     assert said in capsys.readouterr().err

@@ -138,6 +138,17 @@ def gaussians_file(path: str | Path, iteration: int) -> Path:
     return Path(path) if is_file_of_gaussians(path) else ply_path(path, iteration)
 
 
+def refuse_model(output: Path, model: str | Path, iteration: int = -1) -> None:
+    """Refuse to write the file that a model's Gaussians are read from.
+
+    Raises:
+        InputError: if ``output`` is that, or there is no such model.
+    """
+    file = gaussians_file(model, -1 if is_file_of_gaussians(model) else find_iteration(model, iteration))
+    if output.exists() and file.exists() and output.samefile(file):
+        raise InputError(f"{output}: expected another file than the model; name a new one.")
+
+
 def folder_of(path: str | Path) -> Path:
     """The model folder in which a file lies where training puts it; else the path itself."""
     place = Path(os.path.abspath(path))

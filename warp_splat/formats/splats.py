@@ -82,10 +82,15 @@ def cropped(splats: SplatArrays, box: Sequence[float]) -> SplatArrays:
     if len(box) != 6 or not np.less(box[:3], box[3:]).all():
         found = " ".join(f"{value:g}" for value in box)
         raise InputError(f"--crop: expected six numbers, the smallest x, y and z, then the largest; got {found}.")
-    if not (inside := ((splats.means >= box[:3]) & (splats.means <= box[3:])).all(1)).any():
+    if not (inside := within(splats.means, box)).any():
         around = " ".join(f"{value:.3g}" for value in (*splats.means.min(0), *splats.means.max(0)))
         raise InputError(f"--crop: expected a box with Gaussians in it, found none; all of them lie in {around}.")
     return splats.take(inside)
+
+
+def within(means: np.ndarray, box: Sequence[float]) -> np.ndarray:
+    """Whether each of ``means`` [N, 3] lies in a box as :func:`cropped` takes it: [N] bool."""
+    return ((means >= box[:3]) & (means <= box[3:])).all(1)
 
 
 def sizes(splats: SplatArrays) -> np.ndarray:

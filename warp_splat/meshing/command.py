@@ -17,7 +17,7 @@ from warp_splat.config import STRONGEST_MOST, MeshConfig
 from warp_splat.errors import InputError, imported
 from warp_splat.formats.exposures import Exposures
 from warp_splat.formats.files import write_bytes
-from warp_splat.formats.model_folder import check_output
+from warp_splat.formats.model_folder import check_output, refuse_model
 from warp_splat.gaussians import GaussianModel
 from warp_splat.meshing.fusion import HALF, Drawn, Surface, agreed, depth_of, image_at, pixel, surface_of, voxels_of
 from warp_splat.meshing.stereo import filled
@@ -45,10 +45,10 @@ def mesh(config: MeshConfig) -> int:
     """
     if (output := Path(config.output)).suffix.lower() not in ENDINGS:
         raise InputError(f"{output}: expected a name that ends in {', '.join(ENDINGS)}; rename it.")
-    check_output(output)
     pieces_place = output.with_name(f"{output.stem}_collision{output.suffix}")
-    if config.collision:
-        check_output(pieces_place)
+    for place in (output, pieces_place) if config.collision else (output,):
+        refuse_model(place, config.model, config.iteration)
+        check_output(place)
     if config.triangles and config.watertight:
         raise InputError("--triangles: simplifying would open what --watertight closes; take larger voxels (--voxel).")
     for package, wanted in (("trimesh", True), ("fast_simplification", config.triangles), ("vhacdx", config.collision)):
@@ -107,7 +107,10 @@ def drawn_views(opened: Opened, memory: float) -> list[Drawn]:
             shown = render(gaussians, smaller, background, options)
             image = photographed(shown.image.cpu(), view, opened.exposures)
             image = to_srgb(image, torch.where) if view.linear else image
-            found.append(Drawn(smaller, depth_of(shown, smaller).cpu(), image.contiguous()))
+            depth = depth_of(shown, smaller)
+            if opened.shows:
+                depth *= opened.shows(smaller)  # the rest is hidden, or seen from within
+            found.append(Drawn(smaller, depth.cpu(), image.contiguous()))
     return found
 
 

@@ -31,7 +31,7 @@ def clean(config: CleanConfig) -> int:
     Raises:
         InputError: if the model, its scene or an option is not usable; if nothing would be left.
     """
-    output = output_of(config.model, config.output, "cleaned.ply")
+    output = output_of(config, "cleaned.ply")
     opened = Opened(config)
     file, before = opened.file, opened.file.splats
     if (found := floaters(before, opened.setting, config.views, config.near)).all():

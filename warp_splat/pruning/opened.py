@@ -1,7 +1,7 @@
 """What simplify and clean begin and end with: a model opened with its scene, a file written, in numbers."""
 
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -9,19 +9,20 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from warp_splat.config import FinishedModel
+from warp_splat.config import CleanConfig, FinishedModel, SimplifyConfig
 from warp_splat.errors import InputError
 from warp_splat.evaluation.metrics import psnr
 from warp_splat.formats.exchange import format_of, save_gaussians
-from warp_splat.formats.model_folder import check_output, is_file_of_gaussians
-from warp_splat.formats.splats import SplatArrays, SplatFile
+from warp_splat.formats.model_folder import check_output, is_file_of_gaussians, refuse_model
+from warp_splat.formats.splats import SplatArrays, SplatFile, cropped, within
 from warp_splat.gaussians import GaussianModel
+from warp_splat.kernels.harmonics import C0
 from warp_splat.pruning.score import ViewSetting
 from warp_splat.raster.selftest import settle_device
-from warp_splat.rendering.finished import Finished
+from warp_splat.rendering.finished import Finished, make_renderer
 from warp_splat.scene.types import Stored, View
 
-COVERED = 0.9  # of a pixel's light, from which on Gaussians of a crop explain it
+COVERED = 0.9  # of a pixel's light, from which on Gaussians of a crop are what one sees there
 
 
 class Opened(Finished):
@@ -30,6 +31,7 @@ class Opened(Finished):
     Attributes:
         scene: its own.
         setting: its training views, and how they are rendered.
+        shows: a function from a camera to where it sees what a crop left, [H, W] bool; None without one.
 
     Raises:
         InputError: if either cannot be read, or the device cannot be used.
@@ -37,7 +39,7 @@ class Opened(Finished):
 
     def __init__(self, config: FinishedModel):
         used = settle_device(config.device, config.threads)
-        super().__init__(config.model, config.iteration, config.crop)
+        super().__init__(config.model, config.iteration)
         require_some(self)
         self.scene = self.refined(self.load_scene(config.source_path, print))
         if found := self.trained_among(self.scene):
@@ -45,19 +47,30 @@ class Opened(Finished):
                 f"{len(found)} photographs that would be held out now, such as {found[0]}, were trained on: not used."
             )
             self.scene = replace(self.scene, test=[view for view in self.scene.test if view.name not in found])
+        self.shows = None
         if config.crop:
-            train, test = (self._within(views, used) for views in (self.scene.train, self.scene.test))
+            self._crop(config.crop, used)
+            train, test = (self._within(views) for views in (self.scene.train, self.scene.test))
             if not train:
                 raise InputError("--crop: expected Gaussians that cover pixels of photographs, found none; enlarge it.")
             print(f"Only what the Gaussians in the box cover counts, in {len(train)} of {len(self.scene.train)} views.")
             self.scene = replace(self.scene, train=train, test=test)
         self.setting = ViewSetting(self.scene.train, self.options, self.background(used))
 
-    def _within(self, views: list[View], device: torch.device) -> list[View]:
+    def _crop(self, box: Sequence[float], device: torch.device) -> None:
+        """Leave out what is not in a box; it may stand before the rest, or behind."""
+        whole = self.file.splats
+        self.file = self.file._replace(splats=cropped(whole, box))
+        light = np.where(within(whole.means, box), 0.5, -0.5) / C0  # 1 and 0, as coefficients
+        marked = whole._replace(sh=np.repeat(light[:, None, None], 3, axis=2).astype(np.float32))
+        draw = make_renderer(GaussianModel.from_splats(marked).to(device), None, self.options)
+        self.shows = lambda camera: draw(camera).image[..., 0] > COVERED
+
+    def _within(self, views: list[View]) -> list[View]:
         """The views, of which only counts what Gaussians cover: photographs show what a crop left out, too."""
-        draw, found = self.renderer(GaussianModel.from_splats(self.file.splats).to(device)), []
+        found = []
         for view in views:
-            counts = (draw(view.camera).alpha > COVERED).cpu().numpy()
+            counts = self.shows(view.camera).cpu().numpy()
             if view.mask is not None:
                 counts &= view.mask > 0
             if counts.any():
@@ -86,17 +99,16 @@ def require_some(finished: Finished) -> None:
         raise InputError(f"{finished.path}: expected Gaussians to choose from, found none.")
 
 
-def output_of(model: str, output: str, name: str) -> Path:
-    """The file to write: ``output``, or one called ``name`` in the model's folder.
+def output_of(config: SimplifyConfig | CleanConfig, name: str) -> Path:
+    """The file to write: as ``config`` says, or one called ``name`` in the model's folder.
 
     Raises:
-        InputError: if its ending is unknown, it is the model itself, or it could not be written.
+        InputError: if its ending is unknown, it is the model itself, or it could not be written; if there is no model.
     """
-    source = Path(model)
-    path = Path(output) if output else (source.parent if is_file_of_gaussians(source) else source) / name
+    source = Path(config.model)
+    path = Path(config.output) if config.output else (source.parent if is_file_of_gaussians(source) else source) / name
     format_of(path)
-    if path.exists() and source.exists() and path.samefile(source):
-        raise InputError(f"{path}: expected another file than the model; name a new one with -o.")
+    refuse_model(path, source, config.iteration)
     check_output(path)
     return path
 

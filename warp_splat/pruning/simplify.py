@@ -34,7 +34,7 @@ def simplify(config: SimplifyConfig) -> int:
         InputError: if the model, its scene or an option is not usable; if nothing would be left.
     """
     _check(config)
-    output = output_of(config.model, config.output, "simplified.ply")
+    output = output_of(config, "simplified.ply")
     args = folder_of(config.model) / "cfg_args"
     scene = read_cfg_args(args.parent).get("source_path") if args.exists() else ""
     if is_file_of_gaussians(config.model) and not (config.source_path or os.path.exists(str(scene or ""))):

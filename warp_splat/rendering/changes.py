@@ -3,18 +3,17 @@
 Both are measured by reading the new file again; of pictures there is a bound, too, that holds in real arithmetic.
 """
 
-import os
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import torch
 
 from warp_splat.camera import Camera
 from warp_splat.config import ConvertConfig, RasterOptions
-from warp_splat.errors import InputError
 from warp_splat.formats.exchange import format_of, load_gaussians, save_gaussians
-from warp_splat.formats.model_folder import gaussians_file
+from warp_splat.formats.model_folder import refuse_model
 from warp_splat.formats.splats import COEFFICIENTS, SplatArrays
 from warp_splat.formats.stored import LOG_SCALES, SH_C0, sigmoid, unit_quats
 from warp_splat.gaussians import GaussianModel
@@ -37,9 +36,7 @@ def convert(config: ConvertConfig) -> int:
     """
     format_of(config.target)  # before anything is read
     finished = Finished(config.source, crop=config.crop)
-    source = gaussians_file(config.source, finished.iteration)
-    if os.path.exists(config.target) and os.path.samefile(source, config.target):
-        raise InputError(f"{config.target}: expected another file than the source; name a new one.")
+    refuse_model(Path(config.target), config.source)
     notes: list[str] = []
     before = save_gaussians(config.target, finished.placed(), notes.append).splats
     after = load_gaussians(config.target).splats
