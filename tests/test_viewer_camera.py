@@ -154,9 +154,10 @@ def test_free_port():
 
 @pytest.mark.parametrize(("model", "kept"), [("OPENCV_FISHEYE", True), ("EQUIRECTANGULAR", False)])
 def test_photographs_show_through_their_own_lens(model, kept):
-    """A window that is wider than a panorama is a pinhole's."""
+    """A panorama's tiles, and frames that were made smaller, are no panoramas: a pinhole takes its place."""
     lens = Lens(model, (0.02, 0.0, 0.0, 0.0) if kept else ())
     numbers = {"fx": 300 / np.pi, "fy": 300 / np.pi, "cx": 300, "cy": 150, "width": 600, "height": 300}
     wide, box = framed(replace(PHOTO, **numbers, lens=lens), 900, 300)
     assert wide.lens == (lens if kept else None) and (wide.width, wide.height) == (900, 300)
     assert box == np.s_[0:300, 150:750] and (wide.cx, wide.cy) == (450, 150)
+    assert framed(replace(PHOTO, **numbers, lens=lens), 600, 300)[0].lens == wide.lens

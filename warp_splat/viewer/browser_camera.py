@@ -1,5 +1,6 @@
 """From the camera of a browser to ours, and from a photograph's camera to the browser's window."""
 
+from contextlib import suppress
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -66,10 +67,10 @@ def framed(camera: Camera, width: int, height: int) -> tuple[Camera, Box]:
     inner = camera.resized(max(round(camera.width * scale), 1), max(round(camera.height * scale), 1))
     left, top = (width - inner.width) // 2, (height - inner.height) // 2
     size = {"width": width, "height": height, "cx": inner.cx + left, "cy": inner.cy + top, "shutter": None}
-    try:
-        wide = replace(inner, **size)
-    except InputError:
-        wide = replace(inner, **size, lens=None)
+    wide = replace(inner, **size, lens=None)
+    if inner.lens and not inner.lens.family.around:
+        with suppress(InputError):
+            wide = replace(inner, **size)
     return wide, np.s_[top : top + inner.height, left : left + inner.width]
 
 

@@ -156,9 +156,9 @@ class Viewer:
         watcher.changed, watcher.sharp, watcher.drawn_at = False, not moving, time.monotonic()
         try:
             camera, view, box = watcher.camera(watcher.pixels if moving else MOST)
+            watcher.ruler.answer(self.draw_camera, camera, self.unit)
         except InputError:  # a window that was folded up; it will send another camera when it opens
             return
-        watcher.ruler.answer(self.draw_camera, camera, self.unit)
         kind = watcher.kind.value
         out = self.draw_camera(camera, kind == "depth")
         if view is not None:
