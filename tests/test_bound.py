@@ -241,6 +241,7 @@ def test_pictures_of_the_bound(tmp_path):
         ({"bound": True}, (-0.1, 0.0, 0.0), r"options\.bound: expected a background of one color"),
         ({"tolerance": 0.0}, (0, 0, 0), r"options\.tolerance: expected numbers above 0, got 0\.0"),
         ({"tolerance": "much"}, (0, 0, 0), r"options\.tolerance: expected a number or a tensor \[H, W\], got str"),
+        ({"tolerance": torch.tensor(1j)}, (0, 0, 0), r"options\.tolerance: expected a number or a tensor \[H, W\]"),
         ({"tolerance": 1e-2, "normals": True}, (0, 0, 0), r"options\.tolerance: expected none of normals beside it"),
         ({"tolerance": 1e-2, "extent": "square"}, (0, 0, 0), r"options\.tolerance: expected none of extent 'square'"),
         ({"of": "truth"}, (0, 0, 0), r"options\.of: expected one of ideal, trained, got 'truth'"),

@@ -8,7 +8,7 @@ import pytest
 from hostile import refusal
 from scipy.spatial.transform import Rotation
 
-from warp_splat.camera import Camera
+from warp_splat.camera import Camera, mean_up
 from warp_splat.rendering import camera_paths
 from warp_splat.scene.types import Decoded, Scene, View
 
@@ -32,11 +32,25 @@ def test_center_and_forward():
     np.testing.assert_allclose(camera.forward, (1, 0, 0))
 
 
+def test_a_rotation_of_six_decimals_draws_where_it_says():
+    """As in a text file, half a million units from the origin: x in the camera is R x + t, however R was rounded."""
+    turn = Rotation.from_rotvec([0.3, -0.4, 0.5]).as_matrix().round(6)
+    camera = Camera(**{**FIELDS, "rotation": turn, "translation": -turn @ (5e5, -5e5, 1e3)})
+    np.testing.assert_allclose(turn @ camera.center + camera.translation, 0, atol=1e-6)
+
+
 def test_resized_scales_all_of_k():
     small = Camera(**FIELDS).resized(20, 10)
     assert (small.width, small.height) == (20, 10)
     np.testing.assert_allclose((small.fx, small.fy, small.cx, small.cy), (25, 20, 9, 16 / 3))
     np.testing.assert_array_equal(small.rotation, TURN)
+
+
+def test_up_is_where_most_cameras_have_it_or_the_first():
+    camera = Camera(**FIELDS)
+    over = replace(camera, rotation=np.diag([-1.0, -1.0, 1.0]) @ TURN)
+    np.testing.assert_allclose(mean_up([over, camera, camera]), (0, -1, 0))
+    np.testing.assert_allclose(mean_up([over, camera]), (0, 1, 0))
 
 
 def test_camera_copies_what_it_is_given():

@@ -267,7 +267,10 @@ def test_render_shows_photographs_as_they_were_taken(trained, capsys):
     for name in ("exposures.json", "away.json"):
         file.rename(file.with_name(name))
         assert main(["render", "-m", str(folder), "--bound"]) == 0
-        assert (" (before exposures): " in capsys.readouterr().out) == (name == "exposures.json")
+        assert main(["export-html", str(folder), str(folder / "a.html")]) == 0
+        said = capsys.readouterr().out
+        for sentence in (" (before exposures): ", "The page shows the mean exposure"):
+            assert (sentence in said) == (name == "exposures.json")
         written.append([load_png(folder / f"train/ours_6/renders/{place:05d}.png") for place in (0, 1)])
         file.with_name(name).rename(file)
     renders, neutral = written

@@ -236,6 +236,22 @@ def test_gaussians_from_another_origin_are_refused(tmp_path, fails):
     assert read_coordinates(model) == here
 
 
+def test_a_model_of_other_cameras_is_refused(tmp_path, fails):
+    """Structure from motion was run again: names are the same, and places are not."""
+    model, cameras = tmp_path / "model", tmp_path / "model" / "cameras.json"
+    assert main(["train", "-s", str(embedded_scene()), "-m", str(model), *SHORT, "--iterations", "1"]) == 0
+    entries = json.loads(cameras.read_text())
+    write = lambda scale: cameras.write_text(  # noqa: E731
+        json.dumps([{**entry, "position": [scale * x for x in entry["position"]]} for entry in entries])
+    )
+    write(1.001)  # as a training refines them
+    assert main(["render", "-m", str(model), "--skip_train", "--quiet"]) == 0
+    write(2.0)
+    new = ["train", "-s", embedded_scene(), "-m", tmp_path / "new", "--start_ply", model]
+    for command in (["render", "-m", model, "--quiet"], new):
+        assert "name the scene that it was trained on" in fails(*command)
+
+
 def test_damaged_coordinates_get_one_sentence(tmp_path):
     assert read_coordinates(tmp_path) is None
     right = '{"origin": [1, 2, 3], '

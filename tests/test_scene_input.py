@@ -1,5 +1,6 @@
 """Bad scenes: every mistake of a user gets one sentence that names the file."""
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,8 @@ from scene_files import (
     write_colmap,
     write_image,
 )
+
+from warp_splat.scene.images import read_size
 
 
 def cut(path, keep):
@@ -198,3 +201,8 @@ def test_pose_that_is_not_finite_names_the_image(tmp_path, place):
     data[place : place + 8] = np.float64(np.nan).tobytes()
     path.write_bytes(data)
     refusal(lambda: load(root), match=r"only\.png: Camera (rotation|translation): expected finite numbers")
+
+
+def test_a_name_that_is_no_utf_8_gets_a_sentence(tmp_path):
+    """As in an old archive; OpenImageIO takes none."""
+    refusal(lambda: read_size(tmp_path / os.fsdecode(b"caf\xe9.png")), r"caf\udce9.png", "rename the file")

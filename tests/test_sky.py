@@ -70,7 +70,7 @@ def test_formats_without_it_say_so(trained, tmp_path, capsys):
     assert main(["convert", folder, str(tmp_path / "a.splat")]) == 0
     assert "what was learned behind the Gaussians (--parts sky), which no format has" in capsys.readouterr().out
     assert main(["export-html", folder, str(tmp_path / "a.html")]) == 0
-    assert "The page does not have what was learned behind the Gaussians" in capsys.readouterr().out
+    assert "(--parts sky): it is black there." in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("text", ["{", "[]", '{"harmonics": [[1, 2, 3]]}', '{"harmonics": [["a"]]}'])

@@ -212,6 +212,8 @@ def test_bad_input(name, change, found):
     arrays = arrays_of(scene)
     with pytest.raises(InputError, match=found):
         tape.rasterize(**arrays | {name: change(arrays.get(name))}, camera=scene.camera)
+    with pytest.raises(InputError, match="camera: expected a Camera, got CameraParameters"):
+        tape.rasterize(**arrays, camera=warp_splat.CameraParameters(scene.camera))
 
 
 def test_no_gaussian_at_all(device):

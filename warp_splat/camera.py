@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,6 +14,8 @@ from warp_splat.lenses.shutter import Shutter, rotation_vector
 
 MOST_SHARE = 0.5  # of its height by which a picture may move up or down while it is read
 
+EXACT = 1e-12  # share of a center's distance from the origin that is rounding of float64
+LEVEL = 1e-3  # length of a mean of ups from which on it says where up is
 ODD = 2  # px by which a panorama's width may miss twice its height, once it has been resized
 
 # What numbers of a camera are to be, when they are, and of which type.
@@ -125,7 +128,9 @@ class Camera:
     @property
     def center(self) -> np.ndarray:
         """Camera center in world coordinates, [3]."""
-        return -(self.rotation * self.translation[:, None]).sum(0)  # in one order, which a product of matrices has not
+        center = -(self.rotation * self.translation[:, None]).sum(0)  # in one order, unlike a product of matrices
+        off = (self.rotation * center).sum(1) + self.translation  # of a rotation that was rounded, as in a text file
+        return center - off @ self.rotation if np.abs(off).max() > EXACT * np.abs(center).max() else center
 
     @property
     def forward(self) -> np.ndarray:
@@ -167,3 +172,9 @@ class Camera:
         return replace(
             self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy
         )
+
+
+def mean_up(cameras: Sequence[Camera]) -> np.ndarray:
+    """Away from the ground, [3], unit length: where most cameras have it, or the first where they cancel out."""
+    up = -np.mean([camera.rotation[1] for camera in cameras], axis=0)
+    return up / length if (length := float(np.linalg.norm(up))) > LEVEL else -cameras[0].rotation[1]

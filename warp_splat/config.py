@@ -62,7 +62,8 @@ class RasterOptions:
         projection: "affine" (EWA splatting, Zwicker et al. 2001: linearized at the mean) or "ellipsoid" (the exact
             outline of an ellipsoid instead of the Gaussian; Qi, Cai and Han 2024; not of a camera with a lens) or
             "unscented" (seven points through the lens; Wu et al. 2025), or your own; see docs/extending.md.
-        alpha_min: a Gaussian is skipped at pixels where its opacity is below this, 0 to 1; 0 skips nothing.
+        alpha_min: a Gaussian is skipped at pixels where its opacity is below this, 0 to 1; 0 skips
+            none but those of opacity 0.
         alpha_max: an opacity at a pixel is clamped to this, 0 to 0.9999.
         t_min: a pixel stops before the Gaussian that would take its transmittance below this, 0 to 1; 0 means 1e-30.
         max_steps: entries of a tile's list that are looked at, nearest first; None: all of them.

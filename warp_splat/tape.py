@@ -96,6 +96,8 @@ def rasterize(
     """
     given: dict[str, Any] = {"means": means, "quats": quats, "scales": scales, "opacities": opacities}
     given |= {"sh[0]": sh[0], "sh[1]": sh[1]} if isinstance(sh, (tuple, list)) and len(sh) == 2 else {"sh": sh}
+    if not isinstance(camera, Camera):
+        raise InputError(f"camera: expected a Camera, got {type(camera).__name__}; give twist and intrinsics.")
     given |= {"background": background} if isinstance(background, wp.array) else {}
     more = {"twist": twist, "intrinsics": intrinsics, "features": features}
     given |= {name: array for name, array in more.items() if array is not None}

@@ -11,13 +11,14 @@ from string import Template
 import numpy as np
 
 from warp_splat import config as constants
-from warp_splat.camera import Camera
+from warp_splat.camera import Camera, mean_up
 from warp_splat.color import TOE
 from warp_splat.config import ExportHtmlConfig
 from warp_splat.errors import InputError
 from warp_splat.export_html import pack
 from warp_splat.export_html.merge import merged
 from warp_splat.formats import model_folder
+from warp_splat.formats.exposures import read_exposures
 from warp_splat.formats.files import write_text
 from warp_splat.formats.splats import SplatArrays
 from warp_splat.kernels import falloff, harmonics
@@ -54,7 +55,10 @@ def export_html(config: ExportHtmlConfig) -> int:
     size, total = len(page) / 1e6, len(splats.means)
     print(f"{path}: {len(kept.means)} of {total} Gaussians, {len(cameras)} cameras, {size:.1f} MB; for any browser")
     if model_folder.read_environment(config.model, iteration) is not None:
-        print("  The page does not have what was learned behind the Gaussians (--parts sky): it is black there.")
+        behind = "white" if options["BACKGROUND"] else "black"
+        print(f"  The page does not have what was learned behind the Gaussians (--parts sky): it is {behind} there.")
+    if read_exposures(config.model, iteration):
+        print("  The page shows the mean exposure, not that of each photograph (--parts exposure).")
     if trained.get("projection") == "unscented":
         print("  The page draws by the affine projection, not by the unscented one of the training: it differs.")
     if bent := sum(camera.lens is not None for _, camera in cameras):
@@ -102,7 +106,6 @@ def make_page(name: str, splats: SplatArrays, cameras: list[tuple[str, Camera]],
         )
     before = len(parts) if coarse is None else 1
     texels = pack.texels(splats.sh.shape[1])
-    up = -np.mean([camera.rotation[1] for _, camera in cameras], axis=0)
     scene = {
         "count": count,
         "chunk": pack.CHUNK,
@@ -115,7 +118,7 @@ def make_page(name: str, splats: SplatArrays, cameras: list[tuple[str, Camera]],
         "before": before,
         "near": constants.NEAR,
         "origin": origin.tolist(),
-        "up": (up / max(float(np.linalg.norm(up)), 1e-9)).tolist(),
+        "up": mean_up([camera for _, camera in cameras]).tolist(),
         "cameras": [{"name": name, **model_folder.camera_entry(camera)} for name, camera in cameras],
     }
     blocks = {file: _source(file) for file in (*SHADERS, "sort.js")}

@@ -31,7 +31,7 @@ class RenderOutput:
 
     image: torch.Tensor  # [H, W, 3]
     alpha: torch.Tensor  # [H, W], 1 - transmittance
-    depth: torch.Tensor | None  # [H, W] world units, expected depth (0 where alpha is 0), if asked for
+    depth: torch.Tensor | None  # [H, W] world units, expected depth (0 where alpha is 0; off by 1e-7 / alpha), or None
     means2d: torch.Tensor  # [N, 2] px; 0 if culled
     radii: torch.Tensor  # [N] int32, px from the mean to the farthest point where alpha >= alpha_min; 0 if culled
     conics: torch.Tensor  # [N, 3] 1/px^2, (xx, xy, yy) of the inverse 2D covariance; 0 if culled, as all that follow

@@ -79,7 +79,7 @@ def certify(
         raise InputError("options.bound: expected a background of one color without negative numbers; give one.")
     with torch.no_grad():
         count, device, faint = len(splats.radii), background.device, min(options.alpha_min, FAINT)
-        colors, behind = splats.colors.detach(), float(background.max())
+        colors, behind = splats.colors.detach(), float(background.detach().max())
         drawn = max(float(colors.max()) if count else 0.0, behind)  # the brightest color
         errors = _color_errors(gaussians, options, drawn)
         scales, errors = (with_copies(tensor, crossing) for tensor in (gaussians.scales.detach(), errors))
@@ -120,7 +120,7 @@ def certify(
         "begins": starts,
         "brightest": brightest,
         "shade": float(errors[:, 2].max()),
-        "darkest": float(background.min()),
+        "darkest": float(background.detach().min()),
         "behind": behind,
         "everywhere": 0.0 if rules.floor else 2.0 * count * faint * max(brightest, 1.0),
         "unknown": float(lost),

@@ -117,7 +117,8 @@ def check_tolerance(options: RasterOptions, features: object = None) -> None:
     """Raise InputError if the tolerance is no positive number, or if it asks for what only a single pass gives."""
     if (tolerance := options.tolerance) is None:
         return
-    if not isinstance(tolerance, (numbers.Real, torch.Tensor)) or isinstance(tolerance, bool):
+    real = isinstance(tolerance, numbers.Real) or (isinstance(tolerance, torch.Tensor) and not tolerance.is_complex())
+    if not real or isinstance(tolerance, bool):
         raise InputError(f"options.tolerance: expected a number or a tensor [H, W], got {type(tolerance).__name__}.")
     if not bool(torch.as_tensor(tolerance > 0.0).all()):  # pyright: ignore[reportOperatorIssue]
         raise InputError(f"options.tolerance: expected numbers above 0, got {tolerance!r:.60}.")

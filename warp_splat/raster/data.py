@@ -181,7 +181,7 @@ class Dropped:
 
     @property
     def pixels(self) -> int:
-        """Pixels whose upstream gradient was not finite."""
+        """Pixels whose upstream gradient was not finite; counted for each output that has one."""
         return int(self.pixel_count)
 
     @property

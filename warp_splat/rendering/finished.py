@@ -12,6 +12,7 @@ from warp_splat.camera import Camera
 from warp_splat.color import to_bytes
 from warp_splat.config import RasterOptions
 from warp_splat.errors import InputError
+from warp_splat.formats import model_folder
 from warp_splat.formats.coordinates import read_coordinates
 from warp_splat.formats.exposures import Exposures, read_exposures
 from warp_splat.formats.model_folder import folder_of, open_model, read_environment, read_refined, trained_names
@@ -116,6 +117,7 @@ class Finished:
         names["block"] = str(trained.get("block", ""))
         scene = load_scene(source, **names, resolution=resolution, **flags, memory=photo_memory(), report=say)
         scene.refuse_other_origin(self.path, self.placed().coordinates)
+        scene.refuse_other_cameras(self.path, model_folder.read_cameras(folder_of(self.path)))
         return scene
 
     def trained_among(self, scene: Scene) -> list[str]:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from warp_splat.camera import Camera
+from warp_splat.camera import Camera, mean_up
 from warp_splat.scene.types import Scene, visible
 
 CELLS = 24  # along the longer side of a photograph
@@ -20,7 +20,7 @@ def share_of_sky(cameras: Sequence[Camera], points: np.ndarray) -> float:
 
     Up is where most cameras have it. A plain ceiling looks the same.
     """
-    up = -np.mean([camera.rotation[1] for camera in cameras], axis=0)
+    up = mean_up(cameras)
     points = points[:: -(-len(points) // POINTS) or 1].astype(np.float64)
     return float(np.mean([_sky(camera, points, up).mean() for camera in cameras[:: -(-len(cameras) // VIEWS)]]))
 

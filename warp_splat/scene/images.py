@@ -19,7 +19,7 @@ from PIL import Image
 from scipy.ndimage import map_coordinates, maximum_filter, minimum_filter
 
 from warp_splat.camera import Camera
-from warp_splat.errors import InputError, reason_of
+from warp_splat.errors import InputError, reason_of, refusing
 from warp_splat.scene.types import Decoded
 
 THREADS = 2  # OpenImageIO releases the GIL; more threads hold more decoded photographs in memory
@@ -296,7 +296,9 @@ def _quantized(image: np.ndarray) -> np.ndarray:
 def _open(path: Path) -> oiio.ImageInput:
     straight = oiio.ImageSpec()
     straight.attribute("oiio:UnassociatedAlpha", 1)  # else OpenImageIO multiplies by alpha, in the file's 8 bit
-    if (file := oiio.ImageInput.open(str(path), straight)) is None:
+    with refusing(TypeError, f"{str(path)!a}: expected a name in UTF-8", "; rename the file, or its folder."):
+        file = oiio.ImageInput.open(str(path), straight)
+    if file is None:
         raise _unreadable(path, _text(oiio.geterror))
     spec = file.spec()
     pixels, least = spec.width * spec.height, spec.image_bytes() // RATIO_MOST

@@ -1,7 +1,7 @@
 """What a loaded scene is: cameras with their photographs, and what training starts from."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from warp_splat.camera import Camera
+from warp_splat.camera import Camera, mean_up
 from warp_splat.color import to_srgb
 from warp_splat.config import NEAR
 from warp_splat.errors import InputError
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from warp_splat.scene.blocks import Block
 
 WALK = 5.0  # times as far away as what comes near: the largest extent
+REFINED = 0.05  # of a scene's extent by which a training moves no camera
 EVALUATED = 100  # views, at most, of those for training: hundreds more would take hours, and say the same
 
 
@@ -174,11 +175,20 @@ class Scene:
                 f"{coordinates['origin']}; name the scene that they were trained on, or train anew."
             )
 
+    def refuse_other_cameras(self, name: object, cameras: Sequence[tuple[str, Camera]]) -> None:
+        """Raise InputError if ``cameras``, by name, are not those of the scene, but for what a training refines."""
+        centers = {view.name: view.camera.center for view in (*self.train, *self.test)}
+        off = [np.linalg.norm(camera.center - centers[known]) for known, camera in cameras if known in centers]
+        if off and (far := float(np.median(off))) > REFINED * self.extent:
+            raise InputError(
+                f"{name}: expected cameras where {self.source} has them, found them {far:.3g} away (median of "
+                f"{len(off)}); name the scene that it was trained on, or train anew."
+            )
+
     @property
     def up(self) -> np.ndarray:
         """Away from the ground, [3], unit length: as coordinates say it, or the mean of the cameras."""
-        up = UP if self.coordinates else -np.mean([view.camera.rotation[1] for view in self.train], axis=0)
-        return up / np.linalg.norm(up)
+        return UP if self.coordinates else mean_up([view.camera for view in self.train])
 
     @property
     def linear(self) -> bool:

@@ -64,6 +64,7 @@ def sfm(config: SfmConfig) -> int:
     pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value  # its progress is ours to tell
     pycolmap.set_random_seed(config.seed)
     if (scene / "sparse").is_dir():
+        _check_coordinates(scene, work / "summary.json", config)
         say(f"{scene} is complete already; remove it to start anew.")
     else:
         with _explained(work):
@@ -142,6 +143,16 @@ def _claim(source: Path, scene: Path, config: SfmConfig) -> Path:
     return work
 
 
+def _check_coordinates(scene: Path, summary: Path, config: SfmConfig) -> None:
+    """Raise InputError if a complete scene is to have other coordinates now."""
+    before = json.loads(summary.read_text()).get("coordinates", "auto") if summary.is_file() else config.coordinates
+    if config.coordinates not in ("auto", before):
+        raise InputError(
+            f"--coordinates {config.coordinates}: expected a scene that is not complete, found {scene} with those of "
+            f"{before}; remove its sparse/ and run the same again: features and matches are used again."
+        )
+
+
 def _nothing_found(source: Path) -> InputError:
     others, videos = (find_files(photo_root(source), endings) for endings in (OTHER_PHOTOS, VIDEOS))
     hint = "check the path"
@@ -212,6 +223,7 @@ def _reconstruct(root: Path, names: list[str], scene: Path, work: Path, config: 
         "track_length": model.compute_mean_track_length(),
         "threads": config.threads,
         "keep_lens": config.keep_lens,
+        "coordinates": config.coordinates,
         "stages_of_last_run": taken,
     }
 

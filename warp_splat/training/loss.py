@@ -45,7 +45,7 @@ def image_loss(
 
     Args:
         image: [H, W, 3] float32, differentiable.
-        target: [H, W, 3] float32, or uint8 to be divided by 255.
+        target: [H, W, 3] float32, or uint8 to be divided by 255; gets no gradient.
         lambda_dssim: share of the structural term, 0..1.
         mask: [H, W, 1] uint8, 0 for pixels that do not count.
         clamped: compare the image within 0..1, without a gradient where it lies outside.

@@ -138,7 +138,9 @@ def open_scene(config: TrainConfig, begun: Checkpoint | None, say: Say, processe
     same = {name: getattr(data, name) for name in OF_SCENE}
     memory = photo_memory(config.machine.photo_memory, processes)
     scene = load_scene(data.source_path, **same, start=start, memory=memory, report=say)
-    scene.refuse_other_origin(data.start_ply, scene.start and scene.start.coordinates)
+    if scene.start:
+        scene.refuse_other_origin(data.start_ply, scene.start.coordinates)
+        scene.refuse_other_cameras(data.start_ply, model_folder.read_cameras(model_folder.folder_of(data.start_ply)))
     known = model_folder.trained_names(data.start_ply) if scene.start and scene.test and not begun else ()
     if found := [view.name for view in scene.test if view.name in known]:
         say(f"Warning: {data.start_ply} was trained on {len(found)} of {len(scene.test)} images that are held out.")

@@ -215,7 +215,7 @@ def finish(trainer: Trainer, run: Run, say: Callable[[str], None]) -> None:
         total = sum(run.stages.values())
         rows = [(name, f"{value:.2f}", f"{100 * value / total:.0f} %") for name, value in run.stages.items()]
         say(format_table(("stage", "ms per step", "share"), [*rows, ("whole step", f"{total:.2f}", "")]))
-    if trainer.config.learn.settle_from_iter:  # a clock may have said so
+    if trainer.config.learn.settle_from_iter > 1:  # a clock may have said so; 1: blocks, together
         print(f"  flags     {as_flags(trainer.config)}")
         print(f"  time      {run.spent:.1f} s from the first step to the last")
     if (dropped := run.dropped)["prunings"]:

@@ -36,7 +36,7 @@ class Budget(Reference):
         doublings = max((self.end - 1) // interval - self.options.densify_from_iter // interval, 0)
         if not doublings and budget != self.start:
             kept = f"no densification before step {self.end}: there will be {self.start} Gaussians as now"
-            return [f"Warning: {kept}; take more --iterations, or a later --densify_until_iter."]
+            return [f"Warning: {kept}; take more --iterations, or an earlier --densify_from_iter."]
         if budget < self.start:
             return [f"Of {self.start} Gaussians, --max_gaussians {budget} are left at the first densification."]
         if budget > self.start * 2 ** min(doublings, 99):
