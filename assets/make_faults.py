@@ -183,7 +183,10 @@ def main() -> None:
     parser.add_argument("--out", type=pathlib.Path, required=True)
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
+    if (arguments.out / "images").exists():
+        parser.error(f"--out {arguments.out}: expected a new folder, found a scene; name another.")
     make_faulty(arguments.out, arguments.faults, arguments.seed)
+    print(f"{arguments.out}: train on it by `uv run train.py -s {arguments.out} --eval`; truth.json has the faults")
 
 
 if __name__ == "__main__":
