@@ -85,7 +85,7 @@ def test_points_that_all_photographs_show_are_said_to_be():
         for place in range(3)
     ]
     scene = SimpleNamespace(train=views, tracks={"0": None}, points=np.float32([[0, 0, 5]] * 4))
-    assert few_photographs(scene, 25) == (True, "half of its points lie in all 3 photographs")
+    assert few_photographs(scene, 25) == (True, "half of its points lie in all 3 photographs (limit 25)")
 
 
 @pytest.mark.parametrize("gain", [-99.0, 99.0])

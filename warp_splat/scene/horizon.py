@@ -53,6 +53,5 @@ def few_photographs(scene: Scene, limit: int) -> tuple[bool, str]:
         return False, "the scene does not say which points its photographs saw"
     points = scene.points.astype(np.float64)
     shown = float(np.median(sum(visible(view.camera, points).astype(int) for view in scene.train)))
-    if shown >= len(scene.train):
-        return shown < limit, f"half of its points lie in all {len(scene.train)} photographs"
-    return shown < limit, f"half of its points lie in {shown:.0f} photographs or fewer"
+    where = f"all {len(scene.train)} photographs" if shown >= len(scene.train) else f"{shown:.0f} photographs or fewer"
+    return shown < limit, f"half of its points lie in {where} (limit {limit})"

@@ -102,7 +102,9 @@ def _train(config: TrainConfig, processes: Processes) -> int:
     config, weighed = settle_parts(config, scene, processes, say)
     trainer = Trainer(scene, config, processes)
     if config.data.block and (learned := list(trainer.optimizer.parts)):
-        raise InputError(f"--block: expected no part that learns, got {learned[0]}: each block would learn another.")
+        raise InputError(
+            f"--block, --blocks: expected no part that learns, got {learned[0]}: each block would learn another."
+        )
     trainer.told = weighed + trainer.told
     _tell(trainer, run, say)
     with model_folder.claimed(run.folder) if processes.rank == 0 else nullcontext(), _memory_explained(trainer):
