@@ -50,12 +50,17 @@ def check_place(folder: Path) -> None:
         raise InputError(f"{folder}: expected a folder that can be written ({place} {reason}); choose another.")
 
 
-def check_output(path: Path) -> None:
+def check_output(path: Path, model: str | Path = "", iteration: int = -1) -> None:
     """Refuse a file that could not be written, as far as one sees without trying: before the work.
 
     Raises:
-        InputError: if a folder has its name, or as :func:`check_place` of its folder.
+        InputError: if a folder has its name, the Gaussians of ``model`` are read from it, or there are none; or as
+            :func:`check_place` of its folder.
     """
+    if model and path.exists():
+        file = gaussians_file(model, -1 if is_file_of_gaussians(model) else find_iteration(model, iteration))
+        if file.exists() and path.samefile(file):
+            raise InputError(f"{path}: expected another file than the model; name a new one.")
     if path.is_dir():
         raise InputError(f"{path}: expected the name of a file to write, found a folder; name a file in it.")
     check_place(path.parent)
@@ -136,17 +141,6 @@ def is_file_of_gaussians(path: str | Path) -> bool:
 def gaussians_file(path: str | Path, iteration: int) -> Path:
     """Where the Gaussians of a model folder are, or this file."""
     return Path(path) if is_file_of_gaussians(path) else ply_path(path, iteration)
-
-
-def refuse_model(output: Path, model: str | Path, iteration: int = -1) -> None:
-    """Refuse to write the file that a model's Gaussians are read from.
-
-    Raises:
-        InputError: if ``output`` is that, or there is no such model.
-    """
-    file = gaussians_file(model, -1 if is_file_of_gaussians(model) else find_iteration(model, iteration))
-    if output.exists() and file.exists() and output.samefile(file):
-        raise InputError(f"{output}: expected another file than the model; name a new one.")
 
 
 def folder_of(path: str | Path) -> Path:

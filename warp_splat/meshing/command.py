@@ -17,7 +17,7 @@ from warp_splat.config import STRONGEST_MOST, MeshConfig
 from warp_splat.errors import InputError, imported
 from warp_splat.formats.exposures import Exposures
 from warp_splat.formats.files import write_bytes
-from warp_splat.formats.model_folder import check_output, refuse_model
+from warp_splat.formats.model_folder import check_output
 from warp_splat.gaussians import GaussianModel
 from warp_splat.meshing.fusion import HALF, Drawn, Surface, agreed, depth_of, image_at, pixel, surface_of, voxels_of
 from warp_splat.meshing.stereo import filled
@@ -47,8 +47,7 @@ def mesh(config: MeshConfig) -> int:
         raise InputError(f"{output}: expected a name that ends in {', '.join(ENDINGS)}; rename it.")
     pieces_place = output.with_name(f"{output.stem}_collision{output.suffix}")
     for place in (output, pieces_place) if config.collision else (output,):
-        refuse_model(place, config.model, config.iteration)
-        check_output(place)
+        check_output(place, config.model, config.iteration)
     if config.triangles and config.watertight:
         raise InputError("--triangles: simplifying would open what --watertight closes; take larger voxels (--voxel).")
     for package, wanted in (("trimesh", True), ("fast_simplification", config.triangles), ("vhacdx", config.collision)):

@@ -13,10 +13,10 @@ from warp_splat.config import CleanConfig, FinishedModel, SimplifyConfig
 from warp_splat.errors import InputError
 from warp_splat.evaluation.metrics import psnr
 from warp_splat.formats.exchange import format_of, save_gaussians
-from warp_splat.formats.model_folder import check_output, is_file_of_gaussians, refuse_model
+from warp_splat.formats.model_folder import check_output, is_file_of_gaussians
 from warp_splat.formats.splats import SplatArrays, SplatFile, cropped, within
+from warp_splat.formats.stored import SH_C0
 from warp_splat.gaussians import GaussianModel
-from warp_splat.kernels.harmonics import C0
 from warp_splat.pruning.score import ViewSetting
 from warp_splat.raster.selftest import settle_device
 from warp_splat.rendering.finished import Finished, make_renderer
@@ -61,7 +61,7 @@ class Opened(Finished):
         """Leave out what is not in a box; it may stand before the rest, or behind."""
         whole = self.file.splats
         self.file = self.file._replace(splats=cropped(whole, box))
-        light = np.where(within(whole.means, box), 0.5, -0.5) / C0  # 1 and 0, as coefficients
+        light = np.where(within(whole.means, box), 0.5, -0.5) / SH_C0  # 1 and 0, as coefficients
         marked = whole._replace(sh=np.repeat(light[:, None, None], 3, axis=2).astype(np.float32))
         draw = make_renderer(GaussianModel.from_splats(marked).to(device), None, self.options)
         self.shows = lambda camera: draw(camera).image[..., 0] > COVERED
@@ -108,8 +108,7 @@ def output_of(config: SimplifyConfig | CleanConfig, name: str) -> Path:
     source = Path(config.model)
     path = Path(config.output) if config.output else (source.parent if is_file_of_gaussians(source) else source) / name
     format_of(path)
-    refuse_model(path, source, config.iteration)
-    check_output(path)
+    check_output(path, source, config.iteration)
     return path
 
 

@@ -13,7 +13,7 @@ import torch
 from warp_splat.camera import Camera
 from warp_splat.config import ConvertConfig, RasterOptions
 from warp_splat.formats.exchange import format_of, load_gaussians, save_gaussians
-from warp_splat.formats.model_folder import refuse_model
+from warp_splat.formats.model_folder import check_output
 from warp_splat.formats.splats import COEFFICIENTS, SplatArrays
 from warp_splat.formats.stored import LOG_SCALES, SH_C0, sigmoid, unit_quats
 from warp_splat.gaussians import GaussianModel
@@ -36,7 +36,7 @@ def convert(config: ConvertConfig) -> int:
     """
     format_of(config.target)  # before anything is read
     finished = Finished(config.source, crop=config.crop)
-    refuse_model(Path(config.target), config.source)
+    check_output(Path(config.target), config.source)
     notes: list[str] = []
     before = save_gaussians(config.target, finished.placed(), notes.append).splats
     after = load_gaussians(config.target).splats
