@@ -90,7 +90,7 @@ def cropped(splats: SplatArrays, box: Sequence[float]) -> SplatArrays:
 
 def within(means: np.ndarray, box: Sequence[float]) -> np.ndarray:
     """Whether each of ``means`` [N, 3] lies in a box as :func:`cropped` takes it: [N] bool."""
-    return ((means >= box[:3]) & (means <= box[3:])).all(1)
+    return np.all((means >= box[:3]) & (means <= box[3:]), axis=1)
 
 
 def sizes(splats: SplatArrays) -> np.ndarray:

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from warp_splat.camera import Camera
 from warp_splat.config import CleanConfig, FinishedModel, SimplifyConfig
 from warp_splat.errors import InputError
 from warp_splat.evaluation.metrics import psnr
@@ -47,36 +48,23 @@ class Opened(Finished):
                 f"{len(found)} photographs that would be held out now, such as {found[0]}, were trained on: not used."
             )
             self.scene = replace(self.scene, test=[view for view in self.scene.test if view.name not in found])
-        self.shows = None
-        if config.crop:
-            self._crop(config.crop, used)
-            train, test = (self._within(views) for views in (self.scene.train, self.scene.test))
+        self.shows = self._crop(config.crop, used) if config.crop else None
+        if self.shows:
+            train, test = (within_sight(views, self.shows) for views in (self.scene.train, self.scene.test))
             if not train:
                 raise InputError("--crop: expected Gaussians that cover pixels of photographs, found none; enlarge it.")
             print(f"Only what the Gaussians in the box cover counts, in {len(train)} of {len(self.scene.train)} views.")
             self.scene = replace(self.scene, train=train, test=test)
         self.setting = ViewSetting(self.scene.train, self.options, self.background(used))
 
-    def _crop(self, box: Sequence[float], device: torch.device) -> None:
-        """Leave out what is not in a box; it may stand before the rest, or behind."""
+    def _crop(self, box: Sequence[float], device: torch.device) -> Callable[[Camera], torch.Tensor]:
+        """Leave out what is not in a box; returns ``shows``. What is left may stand before the rest, or behind."""
         whole = self.file.splats
         self.file = self.file._replace(splats=cropped(whole, box))
         light = np.where(within(whole.means, box), 0.5, -0.5) / SH_C0  # 1 and 0, as coefficients
         marked = whole._replace(sh=np.repeat(light[:, None, None], 3, axis=2).astype(np.float32))
         draw = make_renderer(GaussianModel.from_splats(marked).to(device), None, self.options)
-        self.shows = lambda camera: draw(camera).image[..., 0] > COVERED
-
-    def _within(self, views: list[View]) -> list[View]:
-        """The views, of which only counts what Gaussians cover: photographs show what a crop left out, too."""
-        found = []
-        for view in views:
-            counts = self.shows(view.camera).cpu().numpy()
-            if view.mask is not None:
-                counts &= view.mask > 0
-            if counts.any():
-                read = partial(lambda view, mask: view.pixels._replace(mask=mask), view, counts.astype(np.uint8))
-                found.append(replace(view, photograph=Stored(read, view.linear, alpha=True, mask=True)))
-        return found
+        return lambda camera: draw(camera).image[..., 0] > COVERED
 
     def picture_of(self, splats: SplatArrays) -> Callable[..., np.ndarray]:
         """A function from a camera, and whose photograph's exposure it has, to what ``splats`` look like: uint8."""
@@ -91,6 +79,19 @@ class Opened(Finished):
         """PSNR [dB] of the training views and, if there are any, of those held out."""
         views = {"train": self.scene.train, "test": self.scene.test}
         return {name: self.psnr(splats, some) for name, some in views.items() if some}
+
+
+def within_sight(views: list[View], shows: Callable[[Camera], torch.Tensor]) -> list[View]:
+    """The views, of which only counts what Gaussians cover: photographs show what a crop left out, too."""
+    found = []
+    for view in views:
+        counts = shows(view.camera).cpu().numpy()
+        if view.mask is not None:
+            counts &= view.mask > 0
+        if counts.any():
+            read = partial(lambda view, mask: view.pixels._replace(mask=mask), view, counts.astype(np.uint8))
+            found.append(replace(view, photograph=Stored(read, view.linear, alpha=True, mask=True)))
+    return found
 
 
 def require_some(finished: Finished) -> None:
