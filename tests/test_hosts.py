@@ -26,7 +26,7 @@ from test_sharding import GROWTHS, SCHEDULE, train
 
 from warp_splat.errors import InputError
 from warp_splat.formats.checkpoint import load_own
-from warp_splat.runtime.rows import Rows
+from warp_splat.runtime.distributed import ALONE
 
 pytestmark = [
     pytest.mark.long,
@@ -265,7 +265,7 @@ def test_a_host_that_comes_back_goes_on(hosts, tmp_path, monkeypatch):
 def iteration(folder):
     """Of the last checkpoint; -1 if there is none, or it is being replaced."""
     try:
-        return load_own(folder, Rows()).facts["iteration"]
+        return load_own(folder, ALONE).facts["iteration"]
     except InputError:
         return -1
 
@@ -279,5 +279,5 @@ def until(true, seconds, hosts):
 
 def goes_on(folder):
     """One process resumes what four have left."""
-    end = load_own(folder, Rows()).facts["iteration"] + 8
+    end = load_own(folder, ALONE).facts["iteration"] + 8
     assert "Done after" in python(ROOT / "train.py", "--resume", folder, "--no-shard", "--iterations", end).stdout

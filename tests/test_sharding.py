@@ -19,7 +19,7 @@ from warp_splat.errors import InputError
 from warp_splat.formats.checkpoint import load_own, save_checkpoint, save_in_blocks
 from warp_splat.formats.curve import along_curve, keys_of
 from warp_splat.runtime import watch
-from warp_splat.runtime.rows import Rows
+from warp_splat.runtime.distributed import ALONE
 from warp_splat.runtime.shards import Shards
 from warp_splat.training.options import TrainConfig
 from warp_splat.training.trainer import Trainer
@@ -70,7 +70,7 @@ def of_blocks(question, count):
 @pytest.mark.parametrize("count", [1, 2, 3, 5])
 @pytest.mark.parametrize("levels", [3, 1000])  # many ties, few
 def test_answers_are_those_of_the_whole(count, levels):
-    rng, whole = np.random.default_rng(count), Rows()
+    rng, whole = np.random.default_rng(count), ALONE
     values = torch.from_numpy(rng.integers(-levels, levels, 101).astype(np.float32) / 7)
     values[5:9] = torch.tensor([0.0, -0.0, torch.inf, -torch.inf])
     for most in (0, 1, 40, 101, 200):
@@ -108,7 +108,7 @@ def test_pieces_are_sorted_and_drawn_for_as_those_of_the_whole(count, monkeypatc
     def draw(rows):
         return rows.draw(torch.Generator().manual_seed(5), 100, sizes[:, rows.rank].tolist())
 
-    drawn = Rows().draw(torch.Generator().manual_seed(5), 100, sizes.sum(1).tolist()).split(sizes.sum(1).tolist())
+    drawn = ALONE.draw(torch.Generator().manual_seed(5), 100, sizes.sum(1).tolist()).split(sizes.sum(1).tolist())
     for rank, some in enumerate(of_blocks(draw, count)):
         assert torch.equal(some, own(drawn, rank))
 
@@ -165,7 +165,7 @@ def test_blocks_are_a_checkpoint_of_any_number_of_processes(tmp_path):
 
     def check():
         for count in (1, 2, 4):
-            for rows in [Rows()] if count == 1 else [Shards(rank, count) for rank in range(count)]:
+            for rows in [ALONE] if count == 1 else [Shards(rank, count) for rank in range(count)]:
                 found, expected = load_own(tmp_path, rows).arrays, part(rows)
                 assert found.keys() == expected.keys()
                 assert all(np.array_equal(found[name], array) for name, array in expected.items())
@@ -182,10 +182,10 @@ def test_blocks_are_a_checkpoint_of_any_number_of_processes(tmp_path):
     refusal(lambda: load_own(path, Shards(0, 11)), "one of 10 Gaussians, fewer than there are processes")
     (tmp_path / "checkpoint-4-1-of-2.safetensors").mkdir()
     refusal(lambda: of_blocks(save(4), 2), "process 1 could not write its block")
-    assert load_own(path, Rows()).facts["iteration"] == 3
+    assert load_own(path, ALONE).facts["iteration"] == 3
     check()
     (tmp_path / "checkpoint-3-1-of-2.safetensors").write_bytes(b"")
-    refusal(lambda: load_own(path, Rows()), match=r"checkpoint-3-1-of-2.*damaged")
+    refusal(lambda: load_own(path, ALONE), match=r"checkpoint-3-1-of-2.*damaged")
 
 
 @pytest.mark.parametrize("options", [{"half_moments": True}, {"parts": "pose"}])

@@ -10,7 +10,7 @@ import torch
 from scipy.spatial import KDTree
 from torch.autograd.function import once_differentiable
 
-from warp_splat.formats.curve import ALONE, along_curve, keys_of
+from warp_splat.formats.curve import along_curve, keys_of
 from warp_splat.formats.exchange import load_gaussians
 from warp_splat.formats.ply import save_ply_parts
 from warp_splat.formats.splats import SplatArrays
@@ -19,8 +19,8 @@ from warp_splat.kernels.falloff import LN_2
 from warp_splat.kernels.harmonics import C0
 from warp_splat.raster.data import Gaussians
 from warp_splat.raster.drivers import driver_of
+from warp_splat.runtime.distributed import ALONE, Processes
 from warp_splat.runtime.launch import arrays_of, launch_in_lanes
-from warp_splat.runtime.rows import Rows
 
 INITIAL_OPACITY = 0.1
 CHUNK = 2**16  # Gaussians that are taken at once, where all together would take much memory
@@ -102,14 +102,14 @@ class GaussianModel:
         """A copy on ``device``."""
         return GaussianModel({name: tensor.to(device) for name, tensor in self.parameters.items()})
 
-    def arranged(self, rows: Rows = ALONE) -> GaussianModel:
-        """A copy whose Gaussians come in the order along the curve; with ``rows``, equal shares of all of them."""
-        moved = self.arranging(rows, [len(self)])
+    def arranged(self, processes: Processes = ALONE) -> GaussianModel:
+        """A copy whose Gaussians come in the order along the curve; with ``processes``, equal shares of all of them."""
+        moved = self.arranging(processes, [len(self)])
         return GaussianModel({name: moved(tensor.detach()) for name, tensor in self.parameters.items()})
 
-    def arranging(self, rows: Rows, sizes: Sequence[int]) -> Callable[[torch.Tensor], torch.Tensor]:
+    def arranging(self, processes: Processes, sizes: Sequence[int]) -> Callable[[torch.Tensor], torch.Tensor]:
         """A function that puts rows in that order; ``sizes``: of the pieces in which they come."""
-        return rows.sorting(keys_of(self.parameters["means"], rows), sizes)
+        return processes.sorting(keys_of(self.parameters["means"], processes), sizes)
 
     @classmethod
     def from_points(

@@ -28,7 +28,6 @@ from warp_splat.errors import InputError
 from warp_splat.formats.exchange import FORMATS
 from warp_splat.formats.files import Unexpected, atomic_write, reading
 from warp_splat.runtime.distributed import Processes
-from warp_splat.runtime.rows import Rows
 
 LAST = "checkpoint.safetensors"  # where the run in a model folder stands
 FORMAT = 1  # rises when older programs could not read what newer ones write
@@ -231,19 +230,19 @@ def save_in_blocks(processes: Processes, path: Path, arrays: Mapping[str, np.nda
                 old.unlink(missing_ok=True)
 
 
-def load_own(path: str | Path, rows: Rows) -> Checkpoint:
-    """:func:`load_checkpoint`, of one file or of blocks: of the Gaussians, what this process holds of ``rows``.
+def load_own(path: str | Path, processes: Processes) -> Checkpoint:
+    """:func:`load_checkpoint`, of one file or of blocks: of the Gaussians, what this one of ``processes`` holds.
 
     Raises:
         InputError: as that does, or if a block is missing or of another checkpoint.
     """
-    if BLOCKS not in (whole := load_checkpoint(path)).facts and not rows.sharded:
+    if BLOCKS not in (whole := load_checkpoint(path)).facts and not processes.sharded:
         return whole
     blocks = whole.facts.get(BLOCKS, {whole.path.name: len(whole.arrays.get("radii", ()))})
     with reading(whole.path, EXPECTED):
         if not isinstance(blocks, dict) or not all(Path(n).name == n and type(blocks[n]) is int for n in blocks):
             raise Unexpected("one of other blocks")
-        own, end, taken = rows.own(sum(blocks.values())), 0, []
+        own, end, taken = processes.own(sum(blocks.values())), 0, []
         for name, count in blocks.items():
             first, last, end = max(own.start - end, 0), min(own.stop - end, count), end + count
             if first < last:

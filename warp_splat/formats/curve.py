@@ -3,9 +3,8 @@
 import torch
 
 from warp_splat.formats.splats import SplatArrays
-from warp_splat.runtime.rows import Rows
+from warp_splat.runtime.distributed import ALONE, Processes
 
-ALONE = Rows()  # what is given is all there is
 CELLS = 2**20  # of the Morton curve, along an axis
 #: Masks that put two zeros between the bits of a number below 2^21, after shifts by 32, 16, 8, 4 and 2.
 MORTON = (0x1F00000000FFFF, 0x1F0000FF0000FF, 0x100F00F00F00F00F, 0x10C30C30C30C30C3, 0x1249249249249249)
@@ -20,12 +19,12 @@ def along_curve(means: torch.Tensor) -> torch.Tensor:
     return torch.sort(keys_of(means), stable=True).indices
 
 
-def keys_of(means: torch.Tensor, rows: Rows = ALONE) -> torch.Tensor:
-    """The places of points [N, 3] on that curve, [N] int64; ``rows``: of which they are a part."""
+def keys_of(means: torch.Tensor, processes: Processes = ALONE) -> torch.Tensor:
+    """The places of points [N, 3] on that curve, [N] int64; ``processes``: that hold all the points."""
     values = torch.nan_to_num(means.detach())
-    if not (count := rows.total(len(values))):
+    if not (count := processes.total(len(values))):
         return torch.empty(0, dtype=torch.int64, device=means.device)
-    low, high = rows.between(values, count // 100)  # what lies far out shall not set the size of the cells
+    low, high = processes.between(values, count // 100)  # what lies far out shall not set the size of the cells
     shares = torch.nan_to_num((values - low) / (high - low).amax().clamp_min(1e-30)).clamp(0.0, 1.0)
     cells = (shares * (CELLS - 1)).long()
     for place, mask in enumerate(MORTON):

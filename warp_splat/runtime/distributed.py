@@ -12,12 +12,12 @@ from contextlib import contextmanager
 from datetime import timedelta
 from typing import TypeVar
 
+import numpy as np
 import torch
 import torch.distributed as dist
 
 from warp_splat.errors import InputError, refusing
 from warp_splat.runtime.devices import is_out_of_memory
-from warp_splat.runtime.rows import Rows
 from warp_splat.runtime.timers import stage
 from warp_splat.runtime.watch import Watch, watching
 
@@ -29,8 +29,11 @@ class GroupError(InputError):
     """The processes cannot go on together: one has ended, or their models differ."""
 
 
-class Processes(Rows):
+class Processes:
     """One of several processes, all of which call the same methods in the same order; or one that trains alone.
+
+    About the rows of all Gaussians, in their order, each answers by itself, since it holds them all;
+    :class:`.shards.Shards` has to ask the others.
 
     Attributes:
         rank: number of this process; 0 prints, evaluates and saves.
@@ -44,6 +47,7 @@ class Processes(Rows):
     """
 
     lost = False
+    sharded = False
     watch: Watch | None = None
 
     def __init__(self, rank: int = 0, count: int = 1, local_count: int = 1, images: int = 0):
@@ -117,6 +121,41 @@ class Processes(Rows):
                 f"iterations, found SHA-256 {', '.join(names)} (rank 0, 1, ...); give all the same scene, processors "
                 "or GPUs of one kind, and the same versions of torch and Warp."
             )
+
+    def own(self, count: int) -> slice:
+        """Which of ``count`` rows belong to this process."""
+        return slice(0, count)
+
+    def total(self, count: int) -> int:
+        """Rows in all, of which this process has ``count``."""
+        return count
+
+    def lowest(self, values: torch.Tensor, count: int) -> torch.Tensor:
+        """Which own rows are among the ``count`` of the lowest values of all, ties by their order: [n] bool."""
+        chosen = torch.sort(values, stable=True).indices[:count]
+        return torch.zeros_like(values, dtype=torch.bool).index_fill_(0, chosen, True)
+
+    def between(self, values: torch.Tensor, spare: int) -> tuple[torch.Tensor, torch.Tensor]:
+        """In each column of all ``values`` [n, 3], what is left between the ``spare`` lowest and highest: two [3]."""
+        low, high = (values.kthvalue(place, dim=0).values for place in (1 + spare, len(values) - spare))
+        return low, high
+
+    def sorting(self, keys: torch.Tensor, sizes: Sequence[int]) -> Callable[[torch.Tensor], torch.Tensor]:
+        """A function that puts rows in the order of their ``keys`` [n] int64, ties by their order.
+
+        ``sizes``: of the pieces in which own rows come; all first pieces come before all second ones.
+        """
+        order = torch.sort(keys, stable=True).indices
+        return lambda rows: rows[order]
+
+    def draw(self, random: torch.Generator, levels: int, sizes: Sequence[int]) -> torch.Tensor:
+        """Three random numbers below ``levels`` for each own row [n, 3], on the host; all draw those of all."""
+        return torch.randint(levels, (sum(sizes), 3), generator=random)
+
+    def running_sums(self, values: np.ndarray) -> tuple[float, np.ndarray, float]:
+        """The sum of what is before the own ``values``; the sums up to each of them; the sum of all."""
+        sums = np.cumsum(values)
+        return 0.0, sums, sums[-1]
 
     def _exchange(self, collective: Callable, *arguments) -> None:
         if self.count == 1:

@@ -1,6 +1,6 @@
 """Processes of which each holds a block of the Gaussians: all that travels between them.
 
-Whatever the number of blocks, every answer is the one that :class:`.rows.Rows` gives of the whole, to the bit.
+Whatever the number of blocks, every answer is that of :class:`.distributed.Processes` about the whole, to the bit.
 """
 
 from collections.abc import Callable, Sequence
