@@ -13,13 +13,10 @@ from warp_splat.camera import Camera
 from warp_splat.config import RasterOptions
 from warp_splat.errors import InputError
 from warp_splat.kernels.project import Projection
-from warp_splat.kernels.project.adj_camera import make_adj_intrinsics, make_adj_pose
-from warp_splat.kernels.project.camera_view import CameraView
 from warp_splat.kernels.project.rolling import make_expose
 from warp_splat.lenses import Lens
 from warp_splat.lenses.formulas import PINHOLE
 from warp_splat.lenses.shutter import Shutter, cross, rotated, series
-from warp_splat.raster.data import Gaussians, Splats2D
 from warp_splat.runtime.launch import launch_in_lanes, send
 from warp_splat.runtime.sums import in_pairs
 
@@ -131,12 +128,10 @@ class Tangent(NamedTuple):
     shift: np.ndarray  # [3] of the world
 
 
-def pose_sums(
-    cam: CameraView, lanes: int, gaussians: Gaussians, adj: Gaussians, adj_placed: torch.Tensor
-) -> torch.Tensor:
-    """What :func:`twist_gradient` needs; ``adj_placed``: the part of ``adj.means`` that came not through colors."""
-    inputs = [cam, gaussians.means, gaussians.quats, adj.means, adj_placed, adj.quats]
-    return _sums(make_adj_pose, lanes, 6, gaussians.means, inputs)
+def sums_of(make: Callable[[int], wp.Kernel], lanes: int, columns: int, inputs: list) -> torch.Tensor:
+    """The columns of what a kernel writes of all Gaussians, summed in pairs in float64, in one order everywhere."""
+    count, device = len(inputs[1]), inputs[1].device
+    return in_pairs(launch_in_lanes(make, lanes, count, inputs, [], device, sums=(columns, wp.float32)))
 
 
 def twist_gradient(
@@ -162,15 +157,6 @@ def of_sums(
     return (send(torch.from_numpy(matrix), sums.device) * sums).sum(1).to(like)
 
 
-def intrinsics_sums(
-    cam: CameraView, lanes: int, opacities: torch.Tensor, splats: Splats2D, adj: Splats2D
-) -> torch.Tensor:
-    """What :func:`intrinsics_gradient` needs; ``opacities``: before antialiasing."""
-    inputs = [cam, opacities, splats.means2d, splats.conics, splats.opacities]
-    inputs += [adj.means2d, adj.conics, adj.opacities]
-    return _sums(make_adj_intrinsics, lanes, 4, opacities, inputs)
-
-
 def intrinsics_gradient(camera: Camera, time: np.ndarray, sums: np.ndarray) -> np.ndarray:
     """Of the intrinsics [4], from the sums over all Gaussians [4]; ``time`` [2]: what comes through that of a row."""
     return sums / [camera.fx, camera.fy, 1.0, 1.0] + np.array([0.0, time[0], 0.0, time[1]]) / camera.height
@@ -190,11 +176,6 @@ def _prepared(lens: Lens) -> np.ndarray:
         above, below = (np.array(Lens(lens.model, tuple(end)).numbers) for end in ends)
         columns.append((above - below) / (ends[0] - ends[1]).sum())
     return np.stack(columns, 1)
-
-
-def _sums(make: Callable[[int], wp.Kernel], lanes: int, columns: int, like: torch.Tensor, inputs: list) -> torch.Tensor:
-    """The columns of what a kernel writes, summed in pairs in float64, in one order everywhere."""
-    return in_pairs(launch_in_lanes(make, lanes, len(like), inputs, [], like.device, sums=(columns, wp.float32)))
 
 
 def _numbers(tensor: torch.Tensor) -> np.ndarray:

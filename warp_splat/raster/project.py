@@ -15,6 +15,7 @@ from warp_splat.camera import Camera
 from warp_splat.config import FRUSTUM_MARGIN, RasterOptions
 from warp_splat.errors import InputError
 from warp_splat.kernels.project import Projection
+from warp_splat.kernels.project.adj_camera import make_adj_intrinsics, make_adj_pose
 from warp_splat.kernels.project.camera_view import CameraView
 from warp_splat.kernels.project.lens import LIMIT
 from warp_splat.kernels.project.quarantine import quarantine
@@ -244,12 +245,14 @@ class Project(torch.autograd.Function):
             adj_motion = cameras.motion_gradient([] if it.bend else found, lanes, wants_pose or wants_intrinsics)
             if wants_pose:
                 adj_means += adj_placed
-                sums = cameras.pose_sums(it.cam, lanes, given, adj, adj_placed)
+                inputs = [it.cam, given.means, given.quats, adj_means, adj_placed, adj.quats]
+                sums = cameras.sums_of(make_adj_pose, lanes, 6, inputs)
                 by_twist = partial(cameras.twist_gradient, it.camera, it.here, adj_motion)
                 adj_twist = cameras.of_sums(partial(by_twist, 0), sums, peeks, twist) if wants_twist else None
                 adj_last = cameras.of_sums(partial(by_twist, 1), sums, peeks, last_twist) if wants_last else None
             if wants_intrinsics:
-                sums = cameras.intrinsics_sums(it.cam, lanes, given.opacities, splats, adj_splats)
+                inputs = [it.cam, given.opacities, *splats[:3], *adj_splats[:3]]  # opacities before antialiasing
+                sums = cameras.sums_of(make_adj_intrinsics, lanes, 4, inputs)
                 by_intrinsics = partial(cameras.intrinsics_gradient, it.camera, adj_motion[:, 3])
                 adj_intrinsics = cameras.of_sums(by_intrinsics, sums, peeks, intrinsics)
             if it.bend:
