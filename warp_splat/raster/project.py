@@ -198,7 +198,7 @@ class Project(torch.autograd.Function):
             radii=means.new_full((count,), int(UNSEEN), dtype=torch.int32),
         )
         set_zero(*splats[:-1])
-        _launch_geometry(it, _shapes(gaussians), _geometry(splats))
+        _launch_geometry(it, gaussians[:4], _geometry(splats))
         given = [it.cam, view(gaussians.means, wp.vec3), _harmonics(gaussians.sh_dc, gaussians.sh_rest)]
         _launch_groups(make_shade(lanes), lanes, count, given, [splats.view()], means.device)
         ctx.save_for_backward(*gaussians, *splats, *learned)
@@ -238,8 +238,7 @@ class Project(torch.autograd.Function):
             adj = Gaussians(adj_means, *shapes, adj_dc, adj_rest)
             adj_placed = torch.zeros_like(adj_means) if wants_pose else adj_means  # else added to the colors' part
             outputs, adj_outputs = _geometry(splats), _geometry(adj_splats)
-            adj_inputs = _shapes(adj._replace(means=adj_placed))
-            found = _launch_geometry(it, _shapes(given), outputs, adj_inputs, adj_outputs)
+            found = _launch_geometry(it, given[:4], outputs, [adj_placed, *shapes], adj_outputs)
             adj_twist = adj_intrinsics = adj_last = adj_coefficients = None
             peeks = it.driver.peeks or it.camera.shutter is not None  # whose motion the host has looked at
             adj_motion = cameras.motion_gradient([] if it.bend else found, lanes, wants_pose or wants_intrinsics)
@@ -258,7 +257,7 @@ class Project(torch.autograd.Function):
             if it.bend:
                 adj_coefficients = cameras.coefficients_gradient(it.camera.lens, found, coefficients)
             # a GPU would have to stop for the answer; sh_rest's are multiples of those of sh_dc
-            if not (it.driver.peeks and _all_finite([*_shapes(adj), adj.sh_dc])):
+            if not (it.driver.peeks and _all_finite(adj[:5])):
                 bad = torch.zeros_like(splats.radii)
                 types = (wp.vec3, wp.vec4, wp.vec3, wp.float32, wp.vec3, wp.vec3, wp.int32)
                 outputs = [view(tensor, dtype) for tensor, dtype in zip((*adj, bad), types, strict=True)]
@@ -272,11 +271,6 @@ class Project(torch.autograd.Function):
 def _geometry(splats: Splats2D) -> list[torch.Tensor]:
     """All but the colors."""
     return [splats.means2d, splats.conics, splats.opacities, splats.depths, splats.extents, splats.radii]
-
-
-def _shapes(gaussians: Gaussians) -> list[torch.Tensor]:
-    """All but the colors."""
-    return [gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities]
 
 
 def _all_finite(tensors: Tensors) -> bool:
