@@ -12,7 +12,6 @@ from typing import NamedTuple
 import torch
 import warp as wp
 
-from warp_splat.camera import Camera
 from warp_splat.config import T_LEAST, TILE, RasterOptions
 from warp_splat.kernels.bound import BoundView
 from warp_splat.kernels.falloff import FalloffFunctions, make_falloff
@@ -146,12 +145,6 @@ class Pixels(NamedTuple):
     image: torch.Tensor  # [H, W, 3]
     alpha: torch.Tensor  # [H, W]
     depth: torch.Tensor  # [H, W] world units, sum of weight times z; [0, 0] if not asked for
-
-    @classmethod
-    def empty(cls, camera: Camera, options: RasterOptions, like: torch.Tensor) -> Pixels:
-        """Room for an image of ``camera``'s size on the device of ``like``."""
-        height, width, new = camera.height, camera.width, like.new_empty
-        return cls(new(height, width, 3), new(height, width), new(height, width) if options.depth else new(0, 0))
 
     def view(self) -> PixelsView:
         """As kernels take them."""

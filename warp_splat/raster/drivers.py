@@ -67,7 +67,8 @@ class Driver:
             keep: store every transmittance, for the adjoint "stored".
         """
         tile_count, new, shape = len(bins.ranges), background.new_empty, self.layout.shape
-        pixels = Pixels.empty(camera, options, background)
+        size = camera.height, camera.width
+        pixels = Pixels(new(*size, 3), new(*size), new(*size) if options.depth else new(0, 0))
         final, count = new(tile_count, *shape), new(tile_count, *shape, dtype=self.layout.counts)
         blocks = new(len(bins.instances) if self.lanes > 1 else 0, dtype=torch.int32)
         saved = Saved(final, count, blocks, _room_for_states(bins).view(-1, *shape) if keep else new(0, *shape))
