@@ -97,24 +97,21 @@ def gradients_of(
 
 def run_passes(workload: Workload, adjoint: str, options: RasterOptions) -> None:
     """A forward and a backward pass over the whole image, to be timed."""
+    upstream = workload.background.new_ones(workload.camera.height, workload.camera.width, 3)
     if adjoint == TAPE:
-        differentiate_on_tape(workload)
+        differentiate_on_tape(workload, upstream)
         return
     leaves = Gaussians(*(tensor.clone().requires_grad_() for tensor in workload.gaussians))
-    out = render(leaves, workload.camera, workload.background, options, adjoint)
-    out.image.backward(torch.ones_like(out.image))
+    render(leaves, workload.camera, workload.background, options, adjoint).image.backward(upstream)
 
 
-def differentiate_on_tape(
-    workload: Workload, upstream: torch.Tensor | None = None
-) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-    """The image [H, W, 3], and the gradients by parameter for the upstream gradient [H, W, 3], or for ones."""
+def differentiate_on_tape(workload: Workload, upstream: torch.Tensor) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+    """The image [H, W, 3], and the gradients by parameter for the upstream gradient [H, W, 3]."""
     given = dict(zip(PARAMETERS, (*workload.gaussians[:4], workload.gaussians.sh, workload.background), strict=False))
     arrays = {name: wp.from_torch(tensor.clone(), requires_grad=True) for name, tensor in given.items()}
     with wp.Tape() as recorded:
         out = tape.rasterize(**arrays, camera=workload.camera, options=workload.options)
-    ones = wp.full_like(out.image, wp.vec3(1.0), requires_grad=False)
-    recorded.backward(grads={out.image: ones if upstream is None else wp.from_torch(upstream, wp.vec3)})
+    recorded.backward(grads={out.image: wp.from_torch(upstream, wp.vec3)})
     return wp.to_torch(out.image, requires_grad=False), {name: wp.to_torch(arrays[name].grad) for name in arrays}
 
 
