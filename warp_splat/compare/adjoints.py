@@ -111,17 +111,16 @@ def first_run(workload: Workload, truth: Truth, variant: Variant) -> Measurement
 
 def time_all(workload: Workload, found: dict[Variant, Measurement]) -> None:
     """Interleaved repeats over all variants that ran, fewer where one round takes long."""
-    runnable = {variant: result for variant, result in found.items() if result.errors}
     start, rounds = time.perf_counter(), 0
-    stages_of: dict[Variant, list[dict[str, float]]] = {variant: [] for variant in runnable}
+    stages_of: dict[Variant, list[dict[str, float]]] = {variant: [] for variant in found if found[variant].errors}
     while rounds < REPEATS and (rounds < 2 or time.perf_counter() - start < BUDGET):
-        for variant in runnable:
+        for variant, measured in stages_of.items():
             with timers.profile() as stages:
                 run_passes(workload, variant.adjoint, variant.options(workload))
-            stages_of[variant].append(dict(stages))
+            measured.append(dict(stages))
         rounds += 1
-    for variant, result in runnable.items():
-        measured = stages_of[variant]
+    for variant, measured in stages_of.items():
+        result = found[variant]
         result.forward = [stages["blend"] + stages.get("tape", 0.0) for stages in measured]
         result.backward = [stages["adjoint of blend"] + stages.get("adjoint of tape", 0.0) for stages in measured]
         result.stages = {name: float(np.median([stages[name] for stages in measured])) for name in measured[0]}
