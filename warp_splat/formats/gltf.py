@@ -85,7 +85,8 @@ def load_gltf(path: str | Path, report: Report = print) -> SplatFile:
         required = entries_of(document.json, "extensionsRequired")
         if unknown := [name for name in required if not isinstance(name, str) or name not in UNDERSTOOD]:
             raise Unexpected(f"one that needs the extension {unknown[0]!r:.80}; export it without")
-        placed = [(piece, world) for mesh, world in document.placed_meshes() for piece in _splat_primitives(mesh)]
+        meshes = [(entries_of(mesh, "primitives"), world) for mesh, world in document.placed_meshes()]
+        placed = [(piece, world) for pieces, world in meshes for piece in pieces if NAME in held(piece, "extensions")]
         if not 0 < len(placed) <= MOST_PIECES:
             raise Unexpected(f"{len(placed)} meshes of them in its scene, at most {MOST_PIECES} are read")
         notes: list[str] = []
@@ -158,11 +159,6 @@ def _describe(attributes: dict[str, np.ndarray], file: SplatFile) -> dict:
         "bufferViews": views,
         "buffers": [{"byteLength": offset}],
     }
-
-
-def _splat_primitives(mesh: dict) -> list[dict]:
-    found = [primitive for primitive in entries_of(mesh, "primitives") if isinstance(primitive, dict)]
-    return [each for each in found if isinstance(each.get("extensions"), dict) and NAME in each["extensions"]]
 
 
 def _read_primitive(document: Document, primitive: dict, report: Report) -> SplatArrays:
