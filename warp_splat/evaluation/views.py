@@ -13,7 +13,7 @@ from warp_splat.formats.files import write_text
 from warp_splat.formats.png import load_png, save_png
 from warp_splat.scene.decoding import in_turn
 from warp_splat.scene.types import View
-from warp_splat.text import format_table
+from warp_splat.text import Report, format_table
 
 POSE = "PSNR_POSE"  # PSNR from where the model says that a photograph was taken
 DECIBELS = ("PSNR", "CC_PSNR", POSE)
@@ -84,9 +84,7 @@ def evaluate_views(
     return means, compared
 
 
-def show_views(
-    compared: list[Comparison], folder: Path, split: str, iteration: int, say: Callable[[str], None]
-) -> None:
+def show_views(compared: list[Comparison], folder: Path, split: str, iteration: int, say: Report) -> None:
     """A sheet of the worst and the best views, and a table of all: ``contact_sheet.png``, ``per_view.md``.
 
     ``say`` gets the table, or the worst of its lines where there are many.
