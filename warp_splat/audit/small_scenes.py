@@ -26,11 +26,10 @@ REPEATED = ("cloud", "layers_4000")  # drawn ten times by slow ones, too: an ord
 #: or pictures of 20,000 px.
 OURS = re.compile("log_scales|scales_1e38|not_finite|near_plane|quats_1e-42|size_|ellipsoid|antialiased")
 
-Arrays = dict[str, np.ndarray]
 Drawn = tuple[dict[str, torch.Tensor], Camera]
 
 
-def balls(camera: Camera, pixels, depth, sigma, opacity, color) -> Arrays:
+def balls(camera: Camera, pixels, depth, sigma, opacity, color) -> dict[str, np.ndarray]:
     """Round Gaussians of one color from all sides, at ``pixels`` [N, 2]; the others are numbers or one for each."""
     pixels = np.asarray(pixels, np.float64)
     spread = lambda value, *shape: np.broadcast_to(np.asarray(value, np.float64), (len(pixels), *shape))  # noqa: E731

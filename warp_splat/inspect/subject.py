@@ -18,7 +18,6 @@ from warp_splat.scene.lenses import make_sampling
 from warp_splat.scene.photos import ImageFinder
 from warp_splat.text import few
 
-Level = Literal["ok", "note", "warning", "error"]
 THUMBNAIL = 240  # px, the longer side
 
 
@@ -26,7 +25,7 @@ class Finding(NamedTuple):
     """A verdict: which check, how bad, and one sentence."""
 
     check: str
-    level: Level
+    level: Literal["ok", "note", "warning", "error"]
     text: str
 
 
