@@ -27,7 +27,6 @@ from warp_splat.inspect.verdicts import check_coordinates
 from warp_splat.rendering.camera_paths import focus_point
 from warp_splat.scene import load_scene
 from warp_splat.scene.embedded import embedded_scene
-from warp_splat.sfm import stages
 from warp_splat.sfm.georeference import _gps, georeference
 
 UTM = np.array([691_000.25, 5_335_000.5, 520.0])
@@ -172,7 +171,7 @@ def test_gps_of_photographs_is_read_as_utm(tmp_path, latitude):
         exif.get_ifd(0x8825).update({5: b"\0", 6: 500.0})
         Image.effect_noise((64, 48), 50).convert("RGB").save(tmp_path / f"{index}.jpg", exif=exif)
     database = tmp_path / "database.db"
-    stages.opened(database).close()
+    pycolmap.Database.open(database).close()
     pycolmap.import_images(database, tmp_path, image_names=[f"{index}.jpg" for index in range(3)])
     found, reference = _gps(database)
     assert "UTM zone 32 north" in reference

@@ -15,7 +15,6 @@ from warp_splat.cli import main
 from warp_splat.inspect import cost, geometry
 from warp_splat.inspect.subject import read_subject
 from warp_splat.scene import load_scene
-from warp_splat.sfm import stages
 from warp_splat.training import deadline, memory
 from warp_splat.training.plan import StepTime
 
@@ -70,7 +69,7 @@ def test_photographs_alone_are_told_how_long_their_cameras_take(tmp_path, capsys
     shutil.copy(names[0], photos / "output" / "mine" / "test")  # a picture of a model, no photograph
     for done, said, instead in (
         (lambda: None, True, ""),
-        (lambda: monkeypatch.setattr(stages, "opened", no_room), False, ""),
+        (lambda: monkeypatch.setattr(pycolmap.Database, "open", no_room), False, ""),
         (lambda: monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "missing")), False, ""),
         (lambda: monkeypatch.undo() or [name.write_text("no picture") for name in names], False, "have no features"),
         (lambda: [name.unlink() for name in names[29:]], False, ""),

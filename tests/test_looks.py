@@ -7,7 +7,6 @@ import pytest
 from warp_splat.config import SfmConfig
 from warp_splat.sfm import looks
 from warp_splat.sfm.matching import match
-from warp_splat.sfm.stages import opened
 
 COUNT, SEEN, STEP, DISTINCT = 100, 120, 12, 128  # photographs; features of each; new ones from one to the next
 
@@ -57,7 +56,7 @@ def synthetic(database, names):
     pycolmap.set_random_seed(0)
     options = pycolmap.SyntheticDatasetOptions(num_rigs=1, num_cameras_per_rig=1, num_points3D=60)
     options.num_frames_per_rig = len(names)
-    with opened(database) as connection:
+    with pycolmap.Database.open(database) as connection:
         pycolmap.synthesize_dataset(options, connection)
         images = connection.read_all_images()
         for image, name in zip(images, names, strict=True):
@@ -77,7 +76,7 @@ def test_names_with_spaces_are_matched_and_kept(tmp_path):
     lines: list[str] = []
     config = SfmConfig("", "", matching="looks", threads=1, quiet=True)
     pairs = match(tmp_path / "database.db", config, lines.append)
-    with opened(tmp_path / "database.db") as connection:
+    with pycolmap.Database.open(tmp_path / "database.db") as connection:
         assert sorted(image.name for image in connection.read_all_images()) == names
         assert connection.num_matched_image_pairs() == 28
     assert lines == [f"28 of 28 pairs of photographs compared, by their looks; {pairs} fit"]

@@ -91,7 +91,7 @@ def test_a_lens_is_each_groups_own_where_a_run_goes_on(photos, tmp_path):
     config = SfmConfig(str(photos[0]), str(tmp_path), quiet=True)
     for groups in ([names[:1]], [names[:2], names[2:4]]):
         stages.extract(tmp_path / "database.db", photos[0], groups, config)
-    with stages.opened(tmp_path / "database.db") as connection:
+    with pycolmap.Database.open(tmp_path / "database.db") as connection:
         lenses = [connection.read_image_with_name(name).camera_id for name in names[:4]]
     assert lenses[0] == lenses[1] != lenses[2] == lenses[3]
 

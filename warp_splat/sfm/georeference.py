@@ -11,7 +11,6 @@ from warp_splat.errors import InputError
 from warp_splat.formats.coordinates import AXES, MODEL_FROM_WORLD
 from warp_splat.formats.files import Unexpected, reading
 from warp_splat.scene.colmap_library import pycolmap
-from warp_splat.sfm.stages import opened
 from warp_splat.text import Report, few
 
 POSITIONS, DISTANCES = ["name", "x", "y", "z"], ["name", "other", "distance"]  # first lines of files
@@ -161,7 +160,7 @@ def _described(origin: np.ndarray, reference: str, scale: float, residuals: dict
 
 def _gps(database: Path) -> tuple[dict[str, np.ndarray], str]:
     """Positions in UTM [m], by the names of the photographs whose EXIF has latitude, longitude and altitude."""
-    with opened(database) as connection:
+    with pycolmap.Database.open(database) as connection:
         names = {image.image_id: image.name for image in connection.read_all_images()}
         priors = connection.read_all_pose_priors()
     found = {names[prior.corr_data_id.id]: prior.position for prior in priors if np.isfinite(prior.position).all()}

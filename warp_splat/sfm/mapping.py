@@ -20,7 +20,7 @@ from scipy.sparse.csgraph import connected_components
 from warp_splat.config import SfmConfig
 from warp_splat.scene.colmap_library import pycolmap
 from warp_splat.sfm.matching import fitting
-from warp_splat.sfm.stages import opened, run_watched
+from warp_splat.sfm.stages import run_watched
 
 # Global mapping alone is enough if it registers this share of more photographs than that: incremental mapping takes
 # longer the more there are, and could add little.
@@ -68,7 +68,7 @@ def matches_that_fit(model: pycolmap.Reconstruction, database: Path) -> tuple[np
     A match fits if its two points lie within FITS of each other's epipolar lines (Sampson's error). A mapper leaves out
     points that do not fit its cameras, so the reprojection error of a wrong model may be the smaller one.
     """
-    with opened(database) as connection:
+    with pycolmap.Database.open(database) as connection:
         images = {number: model.image(number) for number in model.reg_image_ids()}
         rays = {n: np.array(i.camera.cam_from_img(connection.read_keypoints(n)[:, :2])) for n, i in images.items()}
         found = [(0, 0)]
@@ -97,7 +97,7 @@ def _told(model: pycolmap.Reconstruction, fit: np.ndarray, every: np.ndarray) ->
 
 
 def _sizes(database: Path) -> tuple[int, int]:
-    with opened(database) as connection:
+    with pycolmap.Database.open(database) as connection:
         return connection.num_images(), connection.num_inlier_matches()
 
 
@@ -115,7 +115,7 @@ def _made(folder: Path, make: Callable[[Path], object]) -> list[pycolmap.Reconst
 
 def _map_globally(database: Path, root: Path, config: SfmConfig, part: Path, seconds: int) -> None:
     """Global mapping (GLOMAP, Pan et al. 2024), with focal lengths from the view graph where no file says them."""
-    with opened(database) as connection:
+    with pycolmap.Database.open(database) as connection:
         known = all(camera.has_prior_focal_length for camera in connection.read_all_cameras())
     # One thread: with two, each run ends in other bytes.
     options = pycolmap.GlobalPipelineOptions(num_threads=1, random_seed=config.seed)
@@ -150,7 +150,7 @@ def leave_out_doubtful(database: Path) -> None:
     fits += fits.T
     _, parts = connected_components(fits)
     doubtful = ~sure & ((fits[ends[0]] * fits[ends[1]]).sum(axis=1) == 0) & (parts[ends[0]] == parts[ends[1]])
-    with opened(database) as connection:
+    with pycolmap.Database.open(database) as connection:
         for pair in numbers[ends[:, doubtful]].T.tolist():
             connection.delete_two_view_geometry(*pair)
 
@@ -245,7 +245,7 @@ def _with_cameras(
 ) -> pycolmap.Reconstruction:
     """The cameras of ``model``, and those of ``other`` that it lacks; no points."""
     both = pycolmap.Reconstruction()
-    with opened(database) as connection:
+    with pycolmap.Database.open(database) as connection:
         both.load(pycolmap.DatabaseCache.create(connection, pycolmap.DatabaseCacheOptions()))
     for each in (other, model):  # whose lenses are to stay
         for number, camera in each.cameras.items():

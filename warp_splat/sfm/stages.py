@@ -2,6 +2,9 @@
 
 What a stage has found is in the database at once. So a run that was stopped, by Ctrl-C or kill -9, goes on there. A
 model or a folder of images gets its name only when it is complete.
+
+What shows the progress of a stage opens the database before the stage begins: opening writes, and may be refused, or
+refuse another. Python's sqlite3 would do harm: it drops the locks of pycolmap's copy of SQLite.
 """
 
 from __future__ import annotations
@@ -69,18 +72,9 @@ def check_room(folder: Path, full: bool = False) -> None:
         )
 
 
-def opened(database: Path) -> pycolmap.Database:
-    """The database, which a ``with`` closes.
-
-    What shows the progress of a stage opens it before the stage begins: opening writes, and may be refused, or refuse
-    another. Python's sqlite3 would do harm: it drops the locks of pycolmap's copy of SQLite.
-    """
-    return pycolmap.Database.open(database)
-
-
 def rename(database: Path, old: str, new: str) -> None:
     """Write ``new`` for ``old`` in the names of images."""
-    with opened(database) as connection:
+    with pycolmap.Database.open(database) as connection:
         for image in connection.read_all_images():
             if old in image.name:
                 image.name = image.name.replace(old, new)
@@ -93,7 +87,7 @@ def extract(database: Path, root: Path, groups: list[list[str]], config: SfmConf
     for names in groups:  # first, so that images are numbered by name and not by which thread was faster
         reader = pycolmap.ImageReaderOptions()
         reader.camera_model = LENS
-        with opened(database) as connection:
+        with pycolmap.Database.open(database) as connection:
             if len(new := [name for name in names if not connection.exists_image(name)]) < len(names):
                 reader.existing_camera_id = connection.read_image_with_name((set(names) - set(new)).pop()).camera_id
         if new:
@@ -102,7 +96,7 @@ def extract(database: Path, root: Path, groups: list[list[str]], config: SfmConf
     every = [name for names in groups for name in names]
     on_cpu = {"extraction_options": options, "device": pycolmap.Device.cpu}
     work = partial(pycolmap.extract_features, database, root, every, **on_cpu)
-    with opened(database) as connection:
+    with pycolmap.Database.open(database) as connection:
         numbers = [image.image_id for image in connection.read_all_images()]
         found = lambda: sum(map(connection.exists_keypoints, numbers))  # noqa: E731
         run_watched(database.parent, "features", len(numbers), work, found, config.quiet, stops)
