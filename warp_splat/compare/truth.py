@@ -56,8 +56,7 @@ def draw_exactly(
 def random_upstream(shape: torch.Size, fragile: torch.Tensor) -> torch.Tensor:
     """A random upstream gradient of an image, float32; 0 at the pixels that hang on a rounding."""
     weights = torch.randn(shape, generator=torch.Generator().manual_seed(1))
-    weights[fragile] = 0.0
-    return weights
+    return weights.masked_fill(fragile[..., None], 0.0)
 
 
 def compute_truth(workload: Workload) -> Truth:
