@@ -105,13 +105,10 @@ def _harmonics(sh: np.ndarray) -> np.ndarray:
     """[N, texels TEXEL] uint8 from [N, K, 3] coefficients; steps are as small as the largest of five allows."""
     count, coefficients, _ = sh.shape
     shape = (count, texels(coefficients + 1), IN_TEXEL, 3)
-    groups = np.zeros((count, shape[1] * IN_TEXEL, 3), np.float32)
-    groups[:, :coefficients] = np.clip(sh, -LARGEST, LARGEST)
-    groups = groups.reshape(shape)
+    spare = shape[1] * IN_TEXEL - coefficients
+    groups = np.pad(np.clip(sh, -LARGEST, LARGEST), ((0, 0), (0, spare), (0, 0))).reshape(shape)
     largest = np.abs(groups).max(axis=(2, 3)) * (HARMONIC_STEPS / 127)
     exponents = np.ceil(np.log2(np.maximum(largest, 1)))
     steps = np.round(groups * (HARMONIC_STEPS / 2**exponents)[:, :, None, None]).astype(np.int8)
-    rows = np.zeros((*shape[:2], TEXEL), np.uint8)
-    rows[:, :, :-1] = steps.view(np.uint8).reshape(*shape[:2], TEXEL - 1)
-    rows[:, :, -1] = exponents
+    rows = np.dstack([steps.view(np.uint8).reshape(*shape[:2], TEXEL - 1), exponents.astype(np.uint8)])
     return rows.reshape(count, shape[1] * TEXEL)

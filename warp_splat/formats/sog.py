@@ -65,8 +65,7 @@ def save_sog(path: str | Path, file: SplatFile, report: Report = print) -> None:
         entries, labels = palette(sh[:, 1:].reshape(count, -1), min(PALETTE_MOST, max(1024, count // PALETTE_SHARE)))
         numbers, indices = codebook(entries)
         rows = -(-len(entries) // PALETTE_ROW)
-        table = np.zeros((rows * PALETTE_ROW, coefficients - 1, 3), np.uint8)
-        table[: len(entries)] = indices.reshape(-1, coefficients - 1, 3)
+        table = np.pad(indices, ((0, rows * PALETTE_ROW - len(entries)), (0, 0)))
         indices = np.column_stack([labels & 255, labels >> 8, np.zeros_like(labels)])
         facts = {"count": len(entries), "bands": COEFFICIENTS.index(coefficients), "codebook": _listed(numbers)}
         parts["shN"] = facts, {"shN_centroids": table.reshape(rows, -1, 3), "shN_labels": indices}
@@ -196,8 +195,7 @@ def _laid_out(rows: np.ndarray) -> np.ndarray:
     count, channels = rows.shape
     width = 4 * int(np.ceil(np.sqrt(count) / 4))
     height = 4 * -(-count // (4 * width))
-    image = np.zeros((height * width, channels), np.uint8)
-    image[:count] = rows
+    image = np.pad(rows.astype(np.uint8), ((0, height * width - count), (0, 0)))
     return image.reshape(height, width, channels)
 
 

@@ -107,8 +107,8 @@ def load_spz(path: str | Path, report: Report = print) -> SplatFile:
 def _unpack(streams: list[bytes], version: int, degree: int, fraction_bits: int) -> SplatArrays:
     positions, opacities, colors, scales, rotations, harmonics = (np.frombuffer(each, np.uint8) for each in streams)
     count = len(opacities)
-    fixed = np.zeros((count, 3, 4), np.uint8)
-    fixed[..., 1:] = positions.reshape(count, 3, 3)  # into the upper three bytes, so that the sign is in its place
+    # into the upper three bytes, so that the sign is in its place
+    fixed = np.pad(positions.reshape(count, 3, 3), ((0, 0), (0, 0), (1, 0)))
     sh = np.zeros((count, min(DEGREE_COEFFICIENTS[degree], COEFFICIENTS[-1]), 3), np.float32)
     sh[:, 0] = (colors.reshape(count, 3) / np.float32(255) - np.float32(0.5)) / np.float32(COLOR_SCALE)
     higher = harmonics.reshape(count, DEGREE_COEFFICIENTS[degree] - 1, 3)[:, : sh.shape[1] - 1]

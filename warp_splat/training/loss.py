@@ -218,9 +218,8 @@ def _missing(groups: int, length: int) -> torch.Tensor:
     columns = length // CHANNELS
     tap = np.arange(columns)[:, None] + np.arange(WINDOW) - RADIUS
     share = (((tap < 0) | (tap >= columns)) * np.array(list(WEIGHTS))).sum(1)  # in one order, unlike a product
-    missing = torch.zeros(groups * LANES, dtype=torch.float32, device="cpu")
-    missing[:length] = torch.from_numpy(np.repeat(share, CHANNELS))
-    return missing.view(groups, LANES)
+    missing = np.pad(np.repeat(share, CHANNELS), (0, groups * LANES - length)).reshape(groups, LANES)
+    return torch.from_numpy(missing.astype(np.float32))
 
 
 def _taps(rows: torch.Tensor, dtype=vec16):
