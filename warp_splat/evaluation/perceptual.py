@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from warp_splat.errors import refusing
+from warp_splat.errors import InputError, refusing
 from warp_splat.evaluation.metrics import METRICS, Metric, masked, unit_images
 from warp_splat.formats.files import Unexpected, reading
 
@@ -77,11 +77,10 @@ def _load_lpips(path: str) -> tuple[str, Metric]:
         model = LPIPS(net=network, pnet_rand=True, verbose=False)  # without weights, or it would download them
     # "slice2.5.weight" is the layer "features.5.weight" of torchvision
     layers = {layer: f"features.{layer.partition('.')[2]}" for layer in model.net.state_dict()}
-    with reading(path, WEIGHTS):
-        try:
-            model.net.load_state_dict({layer: weights[theirs] for layer, theirs in layers.items()})
-        except (KeyError, RuntimeError) as error:
-            raise Unexpected("others") from error
+    try:
+        model.net.load_state_dict({layer: weights[theirs] for layer, theirs in layers.items()})
+    except (KeyError, RuntimeError) as error:
+        raise InputError(f"{path}: expected {WEIGHTS}, found others.") from error
     name, _, signed = NETWORKS[network]
 
     def measure(image: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = None) -> float:
