@@ -90,12 +90,11 @@ def only(bins: Bins, tiles: torch.Tensor) -> Bins:
     """The lists of some tiles [T] alone."""
     lengths = (bins.ranges[:, 1] - bins.ranges[:, 0]).long()
     order = torch.argsort(bins.ranges[:, 0], stable=True)
-    kept = torch.zeros(len(bins.instances), dtype=torch.bool, device=tiles.device)
     listed = torch.repeat_interleave(tiles[order], lengths[order])
-    kept[: len(listed)] = listed
-    before = torch.cat([kept.new_zeros(1, dtype=torch.int32), kept.cumsum(0, dtype=torch.int32)])
+    kept = torch.nn.functional.pad(listed, (0, len(bins.instances) - len(listed)))
+    before = torch.nn.functional.pad(kept.cumsum(0, dtype=torch.int32), (1, 0))
     chosen = kept[bins.places.long()]
-    places_before = torch.cat([chosen.new_zeros(1, dtype=torch.int32), chosen.cumsum(0, dtype=torch.int32)])
+    places_before = torch.nn.functional.pad(chosen.cumsum(0, dtype=torch.int32), (1, 0))
     ranges = before[bins.ranges.long()]
     return replace(
         bins,
