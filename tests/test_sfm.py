@@ -121,7 +121,7 @@ def test_the_scene_is_said_to_be_complete(photos, scene, tmp_path, capsys):
     assert sorted(path.name for path in scene.iterdir()) == ["images", "sfm", "sparse"]
     places = tmp_path / "places.csv"
     places.write_text("name,x,y,z\na.jpg,1,2,3\n")
-    words = ("--coordinates", "with those of auto", "sparse/")
+    words = ("--coordinates", "has those of auto", "sparse/")
     refusal(lambda: sfm(SfmConfig(str(photos[0]), str(scene), coordinates=str(places))), *words)
     kept = shutil.move(scene / "sfm" / "summary.json", tmp_path)  # as if the run had been killed right before
     assert sfm(SfmConfig(str(photos[0]), str(scene))) == 0

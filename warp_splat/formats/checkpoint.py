@@ -161,10 +161,7 @@ def find_checkpoint(path: str | Path) -> Path:
     if path.is_dir():
         raise InputError(f"{path}: expected {EXPECTED}, found a folder of this name; remove it or name another.")
     if not path.is_file():
-        raise InputError(
-            f"{path}: no such file; expected the {LAST} of a training that has begun, or its folder; what --blocks "
-            "trains goes on by the same command as before."
-        )
+        raise InputError(f"{path}: no such file; name a training's {LAST} or folder (--blocks: run the same again).")
     return path
 
 

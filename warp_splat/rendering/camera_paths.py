@@ -110,9 +110,8 @@ def path_cameras(scene: Scene, count: int, lens: Camera) -> list[Camera]:
     """
     cameras = [view.camera for view in scene.train]
     steps = _distances(cameras, scene.extent)
-    order, tour = np.arange(len(cameras)), _tour(steps)
-    if _length(steps, order) > DETOUR * _length(steps, tour):
-        order = tour
+    named, tour = np.arange(len(cameras)), _tour(steps)
+    order = tour if _length(steps, named) > DETOUR * _length(steps, tour) else named
     keys = order[np.unique(np.linspace(0, len(order) - 1, max(2, count // KEY_FRAMES)).round().astype(int))]
     kept = [keys[0]]
     for key in keys[1:]:

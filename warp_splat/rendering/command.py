@@ -102,7 +102,7 @@ def render_model(config: RenderConfig) -> int:
     if output:  # before frames are drawn for it
         model_folder.check_place(Path(output).parent if Path(output).suffix.lower() == ".mp4" else Path(output))
     given = scene = None
-    if _needs_scene(config):
+    if not config.orbit or config.orbit_center == "focus":  # the timed orbit around the origin looks at no camera
         given = finished.load_scene(config.source_path, say)
         if not (config.skip_test or config.video or config.orbit) and (found := finished.trained_among(given)):
             raise InputError(
@@ -173,11 +173,6 @@ def _check(config: RenderConfig) -> None:
         raise InputError(f"--orbit_center {config.orbit_center}: expected --orbit or --video orbit beside it.")
     if (suffix := Path(config.video_output).suffix.lower()) in OTHER_VIDEOS:
         raise InputError(f"--video_output {config.video_output}: expected .mp4 or a folder, found {suffix}; rename it.")
-
-
-def _needs_scene(config: RenderConfig) -> bool:
-    """Whether cameras of a scene are looked at: all but the timed orbit around the world's origin does."""
-    return not config.orbit or config.orbit_center == "focus"
 
 
 def _memory_explained(device: torch.device, model: GaussianModel, scene: Scene | None):

@@ -100,9 +100,8 @@ def load_scene(
         points, colors, file = points[rows], colors[rows], file and file._replace(splats=file.splats.take(rows))
         report(f"Block {block}: {len(train)} of {counts[0]} training images, {len(points)} of {counts[1]} points.")
     require_visible(train, points, start or source)
-    for told in (too_far(train), "" if drawn else too_near(train, points)):
-        if told:
-            report(f"Warning: {told}")
+    for told in filter(None, (too_far(train), "" if drawn else too_near(train, points))):
+        report(f"Warning: {told}")
     views, bound = load_views(train + test, resolution, white_background, invert_masks, memory)
     halves = (train, views[: len(train)]), (test, views[len(train) :])
     train_views, test_views = (_drop_masked(*half, invert_masks, source, report) for half in halves)

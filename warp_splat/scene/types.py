@@ -167,16 +167,15 @@ class Scene:
         """Where the scene is in the world (``formats/coordinates.py``), if it says so."""
         return read_coordinates(self.source) if self.source else None
 
-    def refuse_other_origin(self, name: object, coordinates: dict | None) -> None:
-        """Raise InputError if Gaussians by this name and the scene both say where they are, and mean other frames."""
+    def refuse_other_frame(
+        self, name: object, coordinates: dict | None, cameras: Sequence[tuple[str, Camera]] = ()
+    ) -> None:
+        """Raise InputError if Gaussians are not where the scene is, as their origin tells, or their cameras by name."""
         if coordinates and self.coordinates and coordinates["origin"] != self.coordinates["origin"]:
             raise InputError(
                 f"{name}: expected Gaussians from the origin {self.coordinates['origin']} of {self.source}, found "
                 f"{coordinates['origin']}; name the scene that they were trained on, or train anew."
             )
-
-    def refuse_other_cameras(self, name: object, cameras: Sequence[tuple[str, Camera]]) -> None:
-        """Raise InputError if ``cameras``, by name, are not those of the scene, but for what a training refines."""
         centers = {view.name: view.camera.center for view in (*self.train, *self.test)}
         off = [np.linalg.norm(camera.center - centers[known]) for known, camera in cameras if known in centers]
         if off and (far := float(np.median(off))) > REFINED * self.extent:

@@ -147,10 +147,7 @@ def _check_coordinates(scene: Path, summary: Path, config: SfmConfig) -> None:
     """Raise InputError if a complete scene is to have other coordinates now."""
     before = json.loads(summary.read_text()).get("coordinates", "auto") if summary.is_file() else config.coordinates
     if config.coordinates not in ("auto", before):
-        raise InputError(
-            f"--coordinates {config.coordinates}: expected a scene that is not complete, found {scene} with those of "
-            f"{before}; remove its sparse/ and run the same again: features and matches are used again."
-        )
+        raise InputError(f"--coordinates {config.coordinates}: {scene} has those of {before}; remove sparse/ there.")
 
 
 def _nothing_found(source: Path) -> InputError:

@@ -139,12 +139,12 @@ def open_scene(config: TrainConfig, begun: Checkpoint | None, say: Say, processe
     memory = photo_memory(config.machine.photo_memory, processes)
     scene = load_scene(data.source_path, **same, start=start, memory=memory, report=say)
     if scene.start:
-        scene.refuse_other_origin(data.start_ply, scene.start.coordinates)
-        scene.refuse_other_cameras(data.start_ply, model_folder.read_cameras(model_folder.folder_of(data.start_ply)))
+        cameras = model_folder.read_cameras(model_folder.folder_of(data.start_ply))
+        scene.refuse_other_frame(data.start_ply, scene.start.coordinates, cameras)
     known = model_folder.trained_names(data.start_ply) if scene.start and scene.test and not begun else ()
     if found := [view.name for view in scene.test if view.name in known]:
         say(f"Warning: {data.start_ply} was trained on {len(found)} of {len(scene.test)} images that are held out.")
-    scene.refuse_other_origin(begun and begun.path, begun and read_coordinates(begun.path.parent))
+    scene.refuse_other_frame(begun and begun.path, begun and read_coordinates(begun.path.parent))
     if not begun and scene.block and scene.block.empty:  # before blocks are trained that could not be merged
         which = f"none of block {scene.block.empty[0] + 1}"
         raise InputError(f"--block {data.block}: expected photographs of each, found {which}; take fewer blocks.")
