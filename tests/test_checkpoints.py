@@ -15,6 +15,7 @@ import pytest
 import safetensors.numpy
 import torch
 from commands import ROOT, SCENE, SHORT, interrupt, no_space, started, train
+from hostile import refusal
 from scene_files import pose, write_colmap
 from splat_files import some_splats
 from test_distributed import torchrun
@@ -251,6 +252,12 @@ def test_another_scene_is_refused(whole, tmp_path, fails):
     before = files_of(whole)
     fails("train", *options[:4], "--no-eval")
     assert files_of(whole) == before
+
+
+def test_another_order_is_refused(scene, stopped, tmp_path):
+    """What belongs to each photograph is kept by its place."""
+    other, _ = begin(replace(scene, train=scene.train[::-1]), tmp_path / "other")
+    refusal(lambda: other.restore(load_checkpoint(tmp_path)), "in another order", "name the scene")
 
 
 @pytest.fixture

@@ -231,8 +231,10 @@ def test_gaussians_from_another_origin_are_refused(tmp_path, fails):
     assert said in fails("train", "-s", scene, "-m", tmp_path / "new", "--start_ply", model)
     assert read_coordinates(model) == here
     write_coordinates(scene, None)
-    assert main(["train", "--resume", str(model), "--iterations", "2"]) == 0
-    assert read_coordinates(model) == here
+    for place in (model, tmp_path / "further"):
+        assert main(["train", "--resume", str(model), "--iterations", "2", "-m", str(place)]) == 0
+        assert read_coordinates(place) == here
+        assert json.loads((place / "cameras.json").read_text())[0]["origin"] == here["origin"]
 
 
 def test_a_model_of_other_cameras_is_refused(tmp_path, fails):
@@ -245,7 +247,10 @@ def test_a_model_of_other_cameras_is_refused(tmp_path, fails):
     )
     write(1.001)  # as a training refines them
     assert main(["render", "-m", str(model), "--skip_train", "--quiet"]) == 0
+    going_on = ["train", "--start_ply", str(model), "-m", str(tmp_path / "going on"), *SHORT, "--iterations", "1"]
+    assert main(going_on) == 0
     write(2.0)
+    assert main(["train", "--resume", going_on[4], "--iterations", "2"]) == 0  # its Gaussians are in the checkpoint
     new = ["train", "-s", embedded_scene(), "-m", tmp_path / "new", "--start_ply", model]
     for command in (["render", "-m", model, "--quiet"], new):
         assert "name the scene that it was trained on" in fails(*command)

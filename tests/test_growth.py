@@ -78,7 +78,7 @@ def test_a_budget_has_to_be_named(flags, growth, least, fails, tmp_path):
             21,
             f"--max_gaussians 9001 will not be reached, since 1 densifications double {POINTS} to 9000 at most.",
         ),
-        (9001, 11, f"Warning: no densification before step 11: there will be {POINTS} Gaussians as now; take more"),
+        (9001, 11, f"Warning: no densification before step 11, so {POINTS} Gaussians stay; take a later --dens"),
     ],
 )
 def test_what_a_budget_makes_is_told(budget, until, sentence, scene):

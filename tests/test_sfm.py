@@ -2,6 +2,7 @@
 
 import ctypes
 import json
+import os
 import re
 import shutil
 import signal
@@ -122,7 +123,13 @@ def test_the_scene_is_said_to_be_complete(photos, scene, tmp_path, capsys):
     places = tmp_path / "places.csv"
     places.write_text("name,x,y,z\na.jpg,1,2,3\n")
     words = ("--coordinates", "has those of auto", "sparse/")
-    refusal(lambda: sfm(SfmConfig(str(photos[0]), str(scene), coordinates=str(places))), *words)
+    again = SfmConfig(str(photos[0]), str(scene), coordinates=os.path.relpath(places))
+    refusal(lambda: sfm(again), *words)
+    older = {name: value for name, value in summary.items() if name != "coordinates"}
+    for told in (older, {**summary, "coordinates": str(places)}):
+        (scene / "sfm" / "summary.json").write_text(json.dumps(told))
+        assert sfm(again) == 0
+    (scene / "sfm" / "summary.json").write_text(json.dumps(summary))
     kept = shutil.move(scene / "sfm" / "summary.json", tmp_path)  # as if the run had been killed right before
     assert sfm(SfmConfig(str(photos[0]), str(scene))) == 0
     shutil.move(kept, scene / "sfm" / "summary.json")

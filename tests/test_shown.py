@@ -262,7 +262,7 @@ def test_photographs_that_were_trained_on_test_nothing(told, tmp_path, fails, ca
     assert "found 7 that were trained on, such as view_001.png; name the scene of then" in fails(*words)
     capsys.readouterr()
     assert main([*map(str, ("simplify", told, "-s", scene, "--keep", "0.5", "-o", tmp_path / "a.ply"))]) == 0
-    assert "7 photographs that would be held out now, such as view_001.png, were trained on" in capsys.readouterr().out
+    assert "7 photographs that are held out now, such as view_001.png, were trained on" in capsys.readouterr().out
     start = "train", "-s", scene, "-m", tmp_path / "new", "--start_ply", told, *SHORT, "--iterations", "1"
     assert main([*map(str, start)]) == 0
     assert f"Warning: {told} was trained on 7 of 7 images that are held out." in capsys.readouterr().out

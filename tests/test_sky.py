@@ -16,7 +16,7 @@ from warp_splat.cli import main
 from warp_splat.color import to_srgb
 from warp_splat.compare.oracle import sh_basis
 from warp_splat.errors import InputError
-from warp_splat.formats.model_folder import ply_path, read_environment
+from warp_splat.formats.model_folder import ply_path, read_environment, write_cfg_args
 from warp_splat.gaussians import GaussianModel
 from warp_splat.lenses import Lens
 from warp_splat.raster.behind import put_behind
@@ -71,6 +71,10 @@ def test_formats_without_it_say_so(trained, tmp_path, capsys):
     assert "what was learned behind the Gaussians (--parts sky), which no format has" in capsys.readouterr().out
     assert main(["export-html", folder, str(tmp_path / "a.html")]) == 0
     assert "(--parts sky): it is black there." in capsys.readouterr().out
+    write_cfg_args(folder, {"white_background": True})
+    assert main(["export-html", folder, str(tmp_path / "a.html")]) == 0
+    assert "(--parts sky): it is white there." in capsys.readouterr().out
+    (trained[1] / "cfg_args").unlink()
 
 
 @pytest.mark.parametrize("text", ["{", "[]", '{"harmonics": [[1, 2, 3]]}', '{"harmonics": [["a"]]}'])

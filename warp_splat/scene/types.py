@@ -1,7 +1,8 @@
 """What a loaded scene is: cameras with their photographs, and what training starts from."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -14,6 +15,7 @@ from warp_splat.color import to_srgb
 from warp_splat.config import NEAR
 from warp_splat.errors import InputError
 from warp_splat.formats.coordinates import UP, read_coordinates
+from warp_splat.formats.model_folder import folder_of, read_cameras
 from warp_splat.formats.splats import SplatFile
 
 if TYPE_CHECKING:
@@ -167,9 +169,7 @@ class Scene:
         """Where the scene is in the world (``formats/coordinates.py``), if it says so."""
         return read_coordinates(self.source) if self.source else None
 
-    def refuse_other_frame(
-        self, name: object, coordinates: dict | None, cameras: Sequence[tuple[str, Camera]] = ()
-    ) -> None:
+    def refuse_other_frame(self, name: str | Path, coordinates: dict | None) -> None:
         """Raise InputError if Gaussians are not where the scene is, as their origin tells, or their cameras by name."""
         if coordinates and self.coordinates and coordinates["origin"] != self.coordinates["origin"]:
             raise InputError(
@@ -177,11 +177,14 @@ class Scene:
                 f"{coordinates['origin']}; name the scene that they were trained on, or train anew."
             )
         centers = {view.name: view.camera.center for view in (*self.train, *self.test)}
+        cameras: list[tuple[str, Camera]] = []
+        with suppress(InputError):  # another trainer's file may tell other things
+            cameras = read_cameras(folder_of(name))
         off = [np.linalg.norm(camera.center - centers[known]) for known, camera in cameras if known in centers]
         if off and (far := float(np.median(off))) > REFINED * self.extent:
             raise InputError(
                 f"{name}: expected cameras where {self.source} has them, found them {far:.3g} away (median of "
-                f"{len(off)}); name the scene that it was trained on, or train anew."
+                f"{len(off)}); name the scene that it was trained on, or its .ply elsewhere if the frames agree."
             )
 
     @property

@@ -59,22 +59,26 @@ def sfm(config: SfmConfig) -> int:
         )
     if config.coordinates not in ("auto", "none"):
         read_places(Path(config.coordinates))  # hours before it is needed
+        config = replace(config, coordinates=os.path.abspath(config.coordinates))
     work = _claim(source, scene, config)
+    summary = work / "summary.json"
+    told = json.loads(summary.read_text()) if summary.is_file() else {}  # else a run was stopped right before
     config = replace(config, threads=min(config.threads or CORES, CORES))
     pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value  # its progress is ours to tell
     pycolmap.set_random_seed(config.seed)
     if (scene / "sparse").is_dir():
-        _check_coordinates(scene, work / "summary.json", config)
+        if config.coordinates not in ("auto", before := told.get("coordinates", config.coordinates)):
+            raise InputError(f"--coordinates {config.coordinates}: {scene} has those of {before}; remove its sparse/.")
         say(f"{scene} is complete already; remove it to start anew.")
     else:
         with _explained(work):
             root = _frames(source, work, config, say) if is_video(source) else photo_root(source)
             names = find_files(root, PHOTOS, None if is_video(source) else scene)
-            summary = _reconstruct(root, names, scene, work, config, say)
-        summary["seconds_of_last_run"] = round(time.perf_counter() - started, 1)
-        write_json(work / "summary.json", summary)
-    if (summary := work / "summary.json").is_file():  # else the run was stopped right before
-        _summarize(scene, json.loads(summary.read_text()))
+            told = _reconstruct(root, names, scene, work, config, say)
+        told["seconds_of_last_run"] = round(time.perf_counter() - started, 1)
+        write_json(summary, told)
+    if told:
+        _summarize(scene, told)
     return 0
 
 
@@ -141,13 +145,6 @@ def _claim(source: Path, scene: Path, config: SfmConfig) -> Path:
         write_text(work / "input.json", record)
         write_text(work / MARKS, marks)
     return work
-
-
-def _check_coordinates(scene: Path, summary: Path, config: SfmConfig) -> None:
-    """Raise InputError if a complete scene is to have other coordinates now."""
-    before = json.loads(summary.read_text()).get("coordinates", "auto") if summary.is_file() else config.coordinates
-    if config.coordinates not in ("auto", before):
-        raise InputError(f"--coordinates {config.coordinates}: {scene} has those of {before}; remove sparse/ there.")
 
 
 def _nothing_found(source: Path) -> InputError:

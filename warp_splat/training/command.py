@@ -142,7 +142,7 @@ def _restore_or_begin(trainer: Trainer, run: Run, begun: Checkpoint | None, say:
     else:
         keep(trainer, run)
     if leads:  # only now: where a checkpoint is refused, the folder stays as it was
-        opening.write_inputs(run.folder, config, trainer.scene, continues=begun is not None)
+        opening.write_inputs(run.folder, config, trainer.scene, begun)
     if leads and config.report.tensorboard:
         run.events = EventLog(run.folder, run.iteration)
     if config.machine.device == "cpu":

@@ -61,7 +61,10 @@ def resolve(config: TrainConfig, processes: Processes) -> tuple[TrainConfig, Che
     done = begun.count("iteration") if begun else 0
     if begun and done > end:  # at the end, what is written there is written again
         raise InputError(f"--iterations {end}: expected at least {done}, as in {begun.path}; name a later end.")
-    folder = _choose_folder(config, begun)
+    default = begun.path.parent if begun else model_folder.default_model_path()
+    folder = Path(config.report.model_path or default)
+    check_folder(config, folder)
+    refuse_other_training(folder, begun)  # nor one that went on from its checkpoint
     say = speaker(quiet)
     device = settle_device(machine.device, threads, [config.model.adjoint], say)
     if machine.data_device == "cuda" and device.type != "cuda":
@@ -86,15 +89,6 @@ def resolve(config: TrainConfig, processes: Processes) -> tuple[TrainConfig, Che
         start_ply=data.start_ply and os.path.abspath(data.start_ply),
     )
     return config, begun
-
-
-def _choose_folder(config: TrainConfig, begun: Checkpoint | None) -> Path:
-    """Where the run writes; never over another training, nor over one that went on from its checkpoint."""
-    default = begun.path.parent if begun else model_folder.default_model_path()
-    folder = Path(config.report.model_path or default)
-    check_folder(config, folder)
-    refuse_other_training(folder, begun)
-    return folder
 
 
 def check_folder(config: TrainConfig, folder: Path) -> None:
@@ -138,34 +132,36 @@ def open_scene(config: TrainConfig, begun: Checkpoint | None, say: Say, processe
     same = {name: getattr(data, name) for name in OF_SCENE}
     memory = photo_memory(config.machine.photo_memory, processes)
     scene = load_scene(data.source_path, **same, start=start, memory=memory, report=say)
-    if scene.start:
-        cameras = model_folder.read_cameras(model_folder.folder_of(data.start_ply))
-        scene.refuse_other_frame(data.start_ply, scene.start.coordinates, cameras)
-    known = model_folder.trained_names(data.start_ply) if scene.start and scene.test and not begun else ()
-    if found := [view.name for view in scene.test if view.name in known]:
-        say(f"Warning: {data.start_ply} was trained on {len(found)} of {len(scene.test)} images that are held out.")
-    scene.refuse_other_frame(begun and begun.path, begun and read_coordinates(begun.path.parent))
-    if not begun and scene.block and scene.block.empty:  # before blocks are trained that could not be merged
+    if begun:
+        scene.refuse_other_frame(begun.path, read_coordinates(begun.path.parent))
+        return scene
+    if scene.block and scene.block.empty:  # before blocks are trained that could not be merged
         which = f"none of block {scene.block.empty[0] + 1}"
         raise InputError(f"--block {data.block}: expected photographs of each, found {which}; take fewer blocks.")
-    if scene.random_points and not begun:
+    if scene.random_points:
         say("Warning: the scene has no points to start from; random ones are taken, which trains worse.")
-    if scene.start and not begun and scene.start.antialiased != config.model.antialiasing:
-        which = "with" if scene.start.antialiased else "without"
-        say(f"Warning: {data.start_ply} was trained {which} --antialiasing; the same option keeps its sizes right.")
-    if scene.start and not begun and scene.start.linear and not scene.linear:
-        say(f"Warning: {data.start_ply} is in linear light, and the photographs are not; its colors start too dark.")
+    if scene.start:
+        scene.refuse_other_frame(start, scene.start.coordinates)
+        known = model_folder.trained_names(start) if scene.test else ()
+        if found := [view.name for view in scene.test if view.name in known]:
+            say(f"Warning: {start} was trained on {len(found)} of {len(scene.test)} images that are held out.")
+        if scene.start.antialiased != config.model.antialiasing:
+            which = "with" if scene.start.antialiased else "without"
+            say(f"Warning: {start} was trained {which} --antialiasing; the same option keeps its sizes right.")
+        if scene.start.linear and not scene.linear:
+            say(f"Warning: {start} is in linear light, and the photographs are not; its colors start too dark.")
     return scene
 
 
-def write_inputs(folder: Path, config: TrainConfig, scene: Scene, continues: bool) -> None:
+def write_inputs(folder: Path, config: TrainConfig, scene: Scene, begun: Checkpoint | None) -> None:
     """Write what this training was given: options, cameras, points."""
     config = config.changed(minutes=0.0)  # a clock cannot be repeated, what it decides can
     model_folder.write_cfg_args(folder, {**config.flat(), "train_test_exp": False, "linear_light": scene.linear})
     write_config(folder, config)
-    model_folder.write_cameras(folder, scene.test, scene.train, scene.coordinates)
-    write_coordinates(folder, scene.coordinates or (read_coordinates(folder) if continues else None))
+    coordinates = scene.coordinates or (read_coordinates(begun.path.parent) if begun else None)
+    model_folder.write_cameras(folder, scene.test, scene.train, coordinates)
+    write_coordinates(folder, coordinates)
     remove_leftovers(folder)
     (folder / BLOCK).unlink(missing_ok=True)  # until this, too, has ended
-    if not (continues and (folder / "input.ply").exists()):
+    if not (begun and (folder / "input.ply").exists()):
         save_points(folder / "input.ply", scene.points, scene.colors)

@@ -256,13 +256,13 @@ class Trainer:
             InputError: if its training views are not those of the scene, or something in it does not fit.
         """
         names, extent = checkpoint.fact("views", list), checkpoint.fact("extent", float)
-        other = {*map(str, names)} ^ {view.name for view in self.scene.train}
-        if other or not math.isclose(extent, self.scene.extent, rel_tol=1e-6):
-            found = f"{len(other)} others, such as {min(other)}" if other else f"{self.scene.extent:.4g}"
+        here = [view.name for view in self.scene.train]
+        if names != here or not math.isclose(extent, self.scene.extent, rel_tol=1e-6):
+            other, turned = {*map(str, names)} ^ {*here}, "" if names == here else ", in another order"
+            found = f"{len(other)} others, such as {min(other)}" if other else f"{self.scene.extent:.4g}{turned}"
             raise InputError(
-                f"{checkpoint.path}: expected training views of the same names and extent ({extent:.4g}) as in this "
-                f"checkpoint, found {found}; name the scene that it was trained on (-s, -i, --eval), or begin anew "
-                f"from its Gaussians (--start_ply {checkpoint.path.parent})."
+                f"{checkpoint.path}: expected training views of the same names, order and extent ({extent:.4g}) as in "
+                f"this checkpoint, found {found}; name the scene that it was trained on (-s, -i, --eval)."
             )
         self.deck.restore(checkpoint)
         counts = {name: checkpoint.count(f"dropped.{name}") for name in (*NOT_FINITE, "prunings")}

@@ -157,7 +157,7 @@ class Viewer:
         try:
             camera, view, box = watcher.camera(watcher.pixels if moving else MOST)
             watcher.ruler.answer(self.draw_camera, camera, self.unit)
-        except InputError:  # a window that was folded up; it will send another camera when it opens
+        except InputError:  # a window that was folded up, which will send another camera when it opens; or a lens
             return
         kind = watcher.kind.value
         out = self.draw_camera(camera, kind == "depth")

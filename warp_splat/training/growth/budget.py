@@ -35,8 +35,8 @@ class Budget(Reference):
         budget, interval = self.setting.max_gaussians, self.options.densification_interval
         doublings = max((self.end - 1) // interval - self.options.densify_from_iter // interval, 0)
         if not doublings and budget != self.start:
-            kept = f"no densification before step {self.end}: there will be {self.start} Gaussians as now"
-            return [f"Warning: {kept}; take more --iterations, or an earlier --densify_from_iter."]
+            more = "more --iterations" if self.end == self.setting.iterations else "a later --densify_until_iter"
+            return [f"Warning: no densification before step {self.end}, so {self.start} Gaussians stay; take {more}."]
         if budget < self.start:
             return [f"Of {self.start} Gaussians, --max_gaussians {budget} are left at the first densification."]
         if budget > self.start * 2 ** min(doublings, 99):
