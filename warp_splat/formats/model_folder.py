@@ -54,7 +54,7 @@ def check_output(path: Path, model: str | Path = "", iteration: int = -1) -> Non
     """Refuse a file that could not be written, as far as one sees without trying: before the work.
 
     Raises:
-        InputError: if a folder has its name, the Gaussians of ``model`` are read from it, or there are none; or as
+        InputError: if a folder has its name, or the Gaussians of ``model`` are read from it; or as
             :func:`check_place` of its folder.
     """
     if model and path.exists():

@@ -102,7 +102,7 @@ def output_of(config: SimplifyConfig | CleanConfig, name: str) -> Path:
     """The file to write: as ``config`` says, or one called ``name`` in the model's folder.
 
     Raises:
-        InputError: if its ending is unknown, it is the model itself, or it could not be written; if there is no model.
+        InputError: if its ending is unknown, it is the model itself, or it could not be written.
     """
     source = Path(config.model)
     path = Path(config.output) if config.output else (source.parent if is_file_of_gaussians(source) else source) / name

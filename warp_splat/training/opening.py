@@ -64,7 +64,7 @@ def resolve(config: TrainConfig, processes: Processes) -> tuple[TrainConfig, Che
     default = begun.path.parent if begun else model_folder.default_model_path()
     folder = Path(config.report.model_path or default)
     check_folder(config, folder)
-    refuse_other_training(folder, begun)  # nor one that went on from its checkpoint
+    refuse_other_training(folder, begun)  # another, or one that went on from the checkpoint
     say = speaker(quiet)
     device = settle_device(machine.device, threads, [config.model.adjoint], say)
     if machine.data_device == "cuda" and device.type != "cuda":
