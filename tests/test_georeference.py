@@ -252,7 +252,8 @@ def test_a_model_of_other_cameras_is_refused(tmp_path, fails):
     write(2.0)
     assert main(["train", "--resume", going_on[4], "--iterations", "2"]) == 0  # its Gaussians are in the checkpoint
     new = ["train", "-s", embedded_scene(), "-m", tmp_path / "new", "--start_ply", model]
-    for command in (["render", "-m", model, "--quiet"], new):
+    resumed = ["train", "--resume", model, "--iterations", "2"]
+    for command in (["render", "-m", model, "--quiet"], new, resumed):
         assert "name the scene that it was trained on" in fails(*command)
 
 

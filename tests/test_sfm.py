@@ -122,7 +122,7 @@ def test_the_scene_is_said_to_be_complete(photos, scene, tmp_path, capsys):
     assert sorted(path.name for path in scene.iterdir()) == ["images", "sfm", "sparse"]
     places = tmp_path / "places.csv"
     places.write_text("name,x,y,z\na.jpg,1,2,3\n")
-    words = ("--coordinates", "has those of auto", "sparse/")
+    words = ("--coordinates", "has those of none", "sparse/")
     again = SfmConfig(str(photos[0]), str(scene), coordinates=os.path.relpath(places))
     refusal(lambda: sfm(again), *words)
     older = {name: value for name, value in summary.items() if name != "coordinates"}
@@ -130,6 +130,7 @@ def test_the_scene_is_said_to_be_complete(photos, scene, tmp_path, capsys):
         (scene / "sfm" / "summary.json").write_text(json.dumps(told))
         assert sfm(again) == 0
     (scene / "sfm" / "summary.json").write_text(json.dumps(summary))
+    assert sfm(SfmConfig(str(photos[0]), str(scene), coordinates="none")) == 0  # there are none
     kept = shutil.move(scene / "sfm" / "summary.json", tmp_path)  # as if the run had been killed right before
     assert sfm(SfmConfig(str(photos[0]), str(scene))) == 0
     shutil.move(kept, scene / "sfm" / "summary.json")

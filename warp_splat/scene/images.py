@@ -296,9 +296,9 @@ def _quantized(image: np.ndarray) -> np.ndarray:
 def _open(path: Path) -> oiio.ImageInput:
     straight = oiio.ImageSpec()
     straight.attribute("oiio:UnassociatedAlpha", 1)  # else OpenImageIO multiplies by alpha, in the file's 8 bit
-    with refusing(TypeError, f"{str(path)!a}: expected a name in UTF-8", "; rename the file, or its folder."):
-        file = oiio.ImageInput.open(str(path), straight)
-    if file is None:
+    with refusing(UnicodeEncodeError, f"{str(path)!a}: expected a name in UTF-8", "; rename the file, or its folder."):
+        str(path).encode()
+    if (file := oiio.ImageInput.open(str(path), straight)) is None:
         raise _unreadable(path, _text(oiio.geterror))
     spec = file.spec()
     pixels, least = spec.width * spec.height, spec.image_bytes() // RATIO_MOST

@@ -217,7 +217,7 @@ def _reconstruct(root: Path, names: list[str], scene: Path, work: Path, config: 
         "track_length": model.compute_mean_track_length(),
         "threads": config.threads,
         "keep_lens": config.keep_lens,
-        "coordinates": config.coordinates,
+        "coordinates": config.coordinates if where else "none",
         "stages_of_last_run": taken,
     }
 

@@ -133,7 +133,7 @@ def open_scene(config: TrainConfig, begun: Checkpoint | None, say: Say, processe
     memory = photo_memory(config.machine.photo_memory, processes)
     scene = load_scene(data.source_path, **same, start=start, memory=memory, report=say)
     if begun:
-        scene.refuse_other_frame(begun.path, read_coordinates(begun.path.parent))
+        scene.refuse_other_frame(begun.path.parent, read_coordinates(begun.path.parent))
         return scene
     if scene.block and scene.block.empty:  # before blocks are trained that could not be merged
         which = f"none of block {scene.block.empty[0] + 1}"

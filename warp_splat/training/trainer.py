@@ -255,11 +255,12 @@ class Trainer:
         Raises:
             InputError: if its training views are not those of the scene, or something in it does not fit.
         """
-        names, extent = checkpoint.fact("views", list), checkpoint.fact("extent", float)
+        names, extent = [*map(str, checkpoint.fact("views", list))], checkpoint.fact("extent", float)
         here = [view.name for view in self.scene.train]
         if names != here or not math.isclose(extent, self.scene.extent, rel_tol=1e-6):
-            other, turned = {*map(str, names)} ^ {*here}, "" if names == here else ", in another order"
-            found = f"{len(other)} others, such as {min(other)}" if other else f"{self.scene.extent:.4g}{turned}"
+            more, fewer = {*here} - {*names}, {*names} - {*here}
+            found = f"{self.scene.extent:.4g}" if names == here else "them in another order"
+            found = f"{len(more)} more and {len(fewer)} fewer, such as {min(more | fewer)}" if more or fewer else found
             raise InputError(
                 f"{checkpoint.path}: expected training views of the same names, order and extent ({extent:.4g}) as in "
                 f"this checkpoint, found {found}; name the scene that it was trained on (-s, -i, --eval)."
