@@ -249,7 +249,7 @@ def test_another_scene_is_refused(whole, tmp_path, fails):
     options = ["--resume", whole, "--iterations", "70", "-m", tmp_path / "a"]
     assert (
         "training views" in (said := fails("train", *options, "--no-eval"))
-        and "7 more and 0 fewer, such as view_000" in said
+        and "7 more, 0 fewer, such as view_000" in said
     )
     assert str(tmp_path) in fails("train", *options, "-s", tmp_path)
     before = files_of(whole)

@@ -184,7 +184,7 @@ class Scene:
         if off and (far := float(np.median(off))) > REFINED * self.extent:
             raise InputError(
                 f"{name}: expected cameras where {self.source} has them, found them {far:.3g} away (median of "
-                f"{len(off)}); name the scene that it was trained on, or its .ply elsewhere if the frames agree."
+                f"{len(off)}); name the scene that it was trained on, or a copy of its .ply (-m, --start_ply)."
             )
 
     @property

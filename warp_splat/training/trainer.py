@@ -260,7 +260,7 @@ class Trainer:
         if names != here or not math.isclose(extent, self.scene.extent, rel_tol=1e-6):
             more, fewer = {*here} - {*names}, {*names} - {*here}
             found = f"{self.scene.extent:.4g}" if names == here else "them in another order"
-            found = f"{len(more)} more and {len(fewer)} fewer, such as {min(more | fewer)}" if more or fewer else found
+            found = f"{len(more)} more, {len(fewer)} fewer, such as {min(more | fewer):.60}" if more or fewer else found
             raise InputError(
                 f"{checkpoint.path}: expected training views of the same names, order and extent ({extent:.4g}) as in "
                 f"this checkpoint, found {found}; name the scene that it was trained on (-s, -i, --eval)."
