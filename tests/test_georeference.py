@@ -8,6 +8,7 @@ import pycolmap
 import pytest
 from commands import SHORT
 from PIL import Image
+from scipy.spatial.transform import Rotation
 from splat_files import some_file
 
 from warp_splat.cli import main
@@ -255,6 +256,18 @@ def test_a_model_of_other_cameras_is_refused(tmp_path, fails):
     resumed = ["train", "--resume", model, "--iterations", "2"]
     for command in (["render", "-m", model, "--quiet"], new, resumed):
         assert "name the scene that it was trained on" in fails(*command)
+    axes = np.array([entry["rotation"] for entry in entries])  # columns, in the world
+    for angle, share, refused in ((0.01, 1, False), (0.1, 1, True), (0.1, 0.4, True), (0.1, 0.1, False)):
+        moved = [
+            axis @ Rotation.from_rotvec([0, 0, angle * (i < share * len(axes))]).as_matrix()
+            for i, axis in enumerate(axes)
+        ]
+        turned = [{**entry, "rotation": axis.tolist()} for entry, axis in zip(entries, moved, strict=True)]
+        cameras.write_text(json.dumps(turned))  # about its own place
+        if refused:
+            assert "moved or turned by 10% of its size" in fails(*resumed)
+        else:
+            assert main(["render", "-m", str(model), "--skip_train", "--quiet"]) == 0
 
 
 def test_damaged_coordinates_get_one_sentence(tmp_path):

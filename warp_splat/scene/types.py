@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from warp_splat.scene.blocks import Block
 
 WALK = 5.0  # times as far away as what comes near: the largest extent
-REFINED = 0.05  # of a scene's extent by which a training moves no camera
+REFINED = 0.05  # of a scene's extent, and rad, by which a training moves or turns no camera
 EVALUATED = 100  # views, at most, of those for training: hundreds more would take hours, and say the same
 
 
@@ -176,15 +176,15 @@ class Scene:
                 f"{name}: expected Gaussians from the origin {self.coordinates['origin']} of {self.source}, found "
                 f"{coordinates['origin']}; name the scene that they were trained on, or train anew."
             )
-        centers = {view.name: view.camera.center for view in (*self.train, *self.test)}
-        cameras: list[tuple[str, Camera]] = []
+        ends = lambda camera: camera.center + self.extent * camera.rotation  # noqa: E731 - of its axes, [3, 3]
+        here, off = {view.name: ends(view.camera) for view in (*self.train, *self.test)}, []
         with suppress(InputError):  # another trainer's file may tell other things
-            cameras = read_cameras(folder_of(name))
-        off = [np.linalg.norm(camera.center - centers[known]) for known, camera in cameras if known in centers]
-        if off and (far := float(np.median(off))) > REFINED * self.extent:
+            cameras = [(ends(camera), here[view]) for view, camera in read_cameras(folder_of(name)) if view in here]
+            off = [np.linalg.norm(there - at, axis=1).max() for there, at in cameras]
+        if off and (far := np.quantile(off, 0.75) / self.extent) > REFINED:
             raise InputError(
-                f"{name}: expected cameras where {self.source} has them, found them {far:.3g} away (median of "
-                f"{len(off)}); name the scene that it was trained on, or a copy of its .ply (-m, --start_ply)."
+                f"{name}: expected cameras as in {self.source}, found a quarter of them moved or turned by {far:.0%} "
+                "of its size; name the scene that it was trained on, or a copy of its .ply (-m, --start_ply)."
             )
 
     @property
