@@ -160,6 +160,20 @@ def test_a_stopped_run_goes_on_and_finds_the_same(photos, scene, tmp_path, numbe
     assert model_bytes(tmp_path / "scene") == model_bytes(scene)
 
 
+def test_ctrl_c_inside_pycolmap_stays_one(scene, tmp_path):
+    """Python that runs inside it may be interrupted; pycolmap takes whatever that raises for a wrong argument."""
+
+    class Interrupted(type(tmp_path)):
+        def __fspath__(self):
+            raise KeyboardInterrupt
+
+    database = shutil.copy(scene / "sfm" / "database.db", tmp_path)
+    with pytest.raises(TypeError):
+        pycolmap.Database.open(Interrupted(database))
+    stages.rename(Interrupted(database), "photo", "picture")
+    assert matching.fitting(Interrupted(database)) == matching.fitting(database)
+
+
 def test_ctrl_c_ends_a_trial_at_once_and_leaves_nothing(tmp_path):
     (tmp_path / "trial").mkdir()
     done = python("-c", TRIAL.format(str(tmp_path / "trial")), check=False)

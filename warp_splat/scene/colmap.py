@@ -104,7 +104,7 @@ def read_model(folder: Path) -> pycolmap.Reconstruction:
     advice = f"; export it again, for COLMAP {pycolmap.__version__} or older."
     # pycolmap raises many types, IndexError and ValueError among them
     with refusing(Exception, f"{folder}: expected a COLMAP model, but pycolmap cannot read it", advice):
-        model = pycolmap.Reconstruction(folder)
+        model = pycolmap.Reconstruction(str(folder))
         if not (folder / "images.bin").is_file():
             _restore_names(model, folder / "images.txt")
         for image in model.reg_image_ids():

@@ -202,7 +202,7 @@ def _reconstruct(root: Path, names: list[str], scene: Path, work: Path, config: 
     if not (where := georeference(model, database, config.coordinates, config.seed, say)):
         scale_as_usual(model)
     path.mkdir(exist_ok=True)
-    model.write(path)
+    model.write(str(path))
     write_coordinates(scene, where)
     with _taking("images", taken):
         stages.write_scene(path, root, scene, work / "scene.part", sizes[0], config)

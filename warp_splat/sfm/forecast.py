@@ -64,7 +64,7 @@ def _measured(root: Path, tried: list[list[str]], config: SfmConfig) -> tuple[fl
         began = time.process_time()
         stages.extract(database, root, tried, config, stops=False)
         extracted = time.process_time()
-        with pycolmap.Database.open(database) as connection:
+        with pycolmap.Database.open(str(database)) as connection:
             count, features = sum(map(len, tried)), connection.num_keypoints()
         match_pairs(database, pairs, len(pairs), config)
         extraction, matching = extracted - began, time.process_time() - extracted

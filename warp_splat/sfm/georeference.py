@@ -160,7 +160,7 @@ def _described(origin: np.ndarray, reference: str, scale: float, residuals: dict
 
 def _gps(database: Path) -> tuple[dict[str, np.ndarray], str]:
     """Positions in UTM [m], by the names of the photographs whose EXIF has latitude, longitude and altitude."""
-    with pycolmap.Database.open(database) as connection:
+    with pycolmap.Database.open(str(database)) as connection:
         names = {image.image_id: image.name for image in connection.read_all_images()}
         priors = connection.read_all_pose_priors()
     found = {names[prior.corr_data_id.id]: prior.position for prior in priors if np.isfinite(prior.position).all()}

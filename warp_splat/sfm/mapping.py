@@ -59,7 +59,7 @@ def reconstruct(
         every = found[best] + [model for name, each in found.items() if name != best for model in each]
         _made(models, partial(_finish, database, root, config, every, images))
         shutil.rmtree(begun)
-    return {int(folder.name): pycolmap.Reconstruction(folder) for folder in models.iterdir()}
+    return {int(folder.name): pycolmap.Reconstruction(str(folder)) for folder in models.iterdir()}
 
 
 def matches_that_fit(model: pycolmap.Reconstruction, database: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -68,7 +68,7 @@ def matches_that_fit(model: pycolmap.Reconstruction, database: Path) -> tuple[np
     A match fits if its two points lie within FITS of each other's epipolar lines (Sampson's error). A mapper leaves out
     points that do not fit its cameras, so the reprojection error of a wrong model may be the smaller one.
     """
-    with pycolmap.Database.open(database) as connection:
+    with pycolmap.Database.open(str(database)) as connection:
         images = {number: model.image(number) for number in model.reg_image_ids()}
         rays = {n: np.array(i.camera.cam_from_img(connection.read_keypoints(n)[:, :2])) for n, i in images.items()}
         found = [(0, 0)]
@@ -97,7 +97,7 @@ def _told(model: pycolmap.Reconstruction, fit: np.ndarray, every: np.ndarray) ->
 
 
 def _sizes(database: Path) -> tuple[int, int]:
-    with pycolmap.Database.open(database) as connection:
+    with pycolmap.Database.open(str(database)) as connection:
         return connection.num_images(), connection.num_inlier_matches()
 
 
@@ -109,13 +109,13 @@ def _made(folder: Path, make: Callable[[Path], object]) -> list[pycolmap.Reconst
         part.mkdir(parents=True)
         make(part)
         os.replace(part, folder)
-    found = [pycolmap.Reconstruction(path) for path in sorted(folder.iterdir())]
+    found = [pycolmap.Reconstruction(str(path)) for path in sorted(folder.iterdir())]
     return sorted(found, key=lambda model: model.num_reg_images(), reverse=True)
 
 
 def _map_globally(database: Path, root: Path, config: SfmConfig, part: Path, seconds: int) -> None:
     """Global mapping (GLOMAP, Pan et al. 2024), with focal lengths from the view graph where no file says them."""
-    with pycolmap.Database.open(database) as connection:
+    with pycolmap.Database.open(str(database)) as connection:
         known = all(camera.has_prior_focal_length for camera in connection.read_all_cameras())
     # One thread: with two, each run ends in other bytes.
     options = pycolmap.GlobalPipelineOptions(num_threads=1, random_seed=config.seed)
@@ -150,7 +150,7 @@ def leave_out_doubtful(database: Path) -> None:
     fits += fits.T
     _, parts = connected_components(fits)
     doubtful = ~sure & ((fits[ends[0]] * fits[ends[1]]).sum(axis=1) == 0) & (parts[ends[0]] == parts[ends[1]])
-    with pycolmap.Database.open(database) as connection:
+    with pycolmap.Database.open(str(database)) as connection:
         for pair in numbers[ends[:, doubtful]].T.tolist():
             connection.delete_two_view_geometry(*pair)
 
@@ -179,7 +179,7 @@ def _map_stepwise(database: Path, root: Path, config: SfmConfig, part: Path, sta
         options.fix_existing_frames = True  # they are adjusted; again, thousands take longer than all before
         for name, value in RELAXED.items():
             setattr(options.mapper, name, value)
-    registered = [1] * (pycolmap.Reconstruction(start).num_reg_images() if start else 0)
+    registered = [1] * (pycolmap.Reconstruction(str(start)).num_reg_images() if start else 0)
     found = {
         "initial_image_pair_callback": lambda: registered.extend((1, 1)),
         "next_image_callback": lambda: registered.append(1),
@@ -196,22 +196,21 @@ def _finish(
         return
     model, others = joined(models, database, root, part, config.threads)
     (part / "0").mkdir()
-    model.write(part / "0")
+    model.write(str(part / "0"))
     if 0 < model.num_reg_images() < images:
         (part / "more").mkdir()
         _map_stepwise(database, root, config, part / "more", part / "0")
         if (part / "more" / "images.bin").is_file():  # where it begins with a model, it writes one there
-            more = pycolmap.Reconstruction(part / "more")
+            more = pycolmap.Reconstruction(str(part / "more"))
             model = more if more.num_reg_images() > model.num_reg_images() else model
-            model.write(part / "0")
+            model.write(str(part / "0"))
         shutil.rmtree(part / "more")
-    number, seen = 0, set(model.reg_image_ids())
+    seen = set(model.reg_image_ids())
     for other in others:
         if seen.isdisjoint(other.reg_image_ids()):  # both mappers may have found it
-            number += 1
             seen.update(other.reg_image_ids())
-            (part / str(number)).mkdir()
-            other.write(part / str(number))
+            (place := part / str(len(os.listdir(part)))).mkdir()  # after "0" and those before it
+            other.write(str(place))
 
 
 def joined(
@@ -232,7 +231,8 @@ def joined(
             other.transform(model_from_other)
             model = _with_cameras(model, other, database)
             options = pycolmap.IncrementalPipelineOptions(num_threads=threads)
-            model = pycolmap.triangulate_points(model, database, root, part / "triangulated", options=options)
+            paths = map(str, (database, root, part / "triangulated"))
+            model = pycolmap.triangulate_points(model, *paths, options=options)
             pycolmap.bundle_adjustment(model)
             shutil.rmtree(part / "triangulated")
             break
@@ -245,7 +245,7 @@ def _with_cameras(
 ) -> pycolmap.Reconstruction:
     """The cameras of ``model``, and those of ``other`` that it lacks; no points."""
     both = pycolmap.Reconstruction()
-    with pycolmap.Database.open(database) as connection:
+    with pycolmap.Database.open(str(database)) as connection:
         both.load(pycolmap.DatabaseCache.create(connection, pycolmap.DatabaseCacheOptions()))
     for each in (other, model):  # whose lenses are to stay
         for number, camera in each.cameras.items():

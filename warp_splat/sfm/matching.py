@@ -46,7 +46,7 @@ def avoid_blas() -> bool:
 
 def match(database: Path, config: SfmConfig, say: Callable[[str], object]) -> int:
     """Match photographs as ``config.matching`` says; returns how many pairs fit together."""
-    with pycolmap.Database.open(database) as connection:
+    with pycolmap.Database.open(str(database)) as connection:
         images = connection.num_images()
         features = connection.num_keypoints() / max(images, 1)
     matching, pairs = pairs_compared(config.matching, images)
@@ -80,13 +80,13 @@ def _run(database: Path, run: Callable, pairing: object, total: int, config: Sfm
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = config.seed
     work = partial(run, database, options, pairing, verification, pycolmap.Device.cpu)
-    with pycolmap.Database.open(database) as connection:
+    with pycolmap.Database.open(str(database)) as connection:
         run_watched(database.parent, "matches", total, work, connection.num_matched_image_pairs, config.quiet)
 
 
 def fitting(database: Path) -> dict[tuple[int, int], int]:
     """How many features fit together, of the pairs of images of which some do."""
-    with pycolmap.Database.open(database) as connection:
+    with pycolmap.Database.open(str(database)) as connection:
         numbers, counts = connection.read_two_view_geometry_num_inliers()
     pairs = map(pycolmap.pair_id_to_image_pair, numbers)
     return {(min(pair), max(pair)): count for pair, count in zip(pairs, counts, strict=True) if count > 0}
@@ -97,7 +97,7 @@ def _match_by_looks(database: Path, config: SfmConfig, say: Callable[[str], obje
 
     Each round asks only what the ones before found. So a run that was stopped comes to the same pairs.
     """
-    with pycolmap.Database.open(database) as connection:
+    with pycolmap.Database.open(str(database)) as connection:
         images = sorted(connection.read_all_images(), key=lambda image: image.name)
         numbers, names = [image.image_id for image in images], [image.name for image in images]
         bar = tqdm(total=2 * len(images), desc="looks", disable=config.quiet, bar_format=BAR)

@@ -74,7 +74,8 @@ def check_room(folder: Path, full: bool = False) -> None:
 
 def rename(database: Path, old: str, new: str) -> None:
     """Write ``new`` for ``old`` in the names of images."""
-    with pycolmap.Database.open(database) as connection:
+    # a string, here and elsewhere: of a Path, pycolmap runs Python, and a Ctrl-C that comes there becomes a TypeError
+    with pycolmap.Database.open(str(database)) as connection:
         for image in connection.read_all_images():
             if old in image.name:
                 image.name = image.name.replace(old, new)
@@ -87,16 +88,16 @@ def extract(database: Path, root: Path, groups: list[list[str]], config: SfmConf
     for names in groups:  # first, so that images are numbered by name and not by which thread was faster
         reader = pycolmap.ImageReaderOptions()
         reader.camera_model = LENS
-        with pycolmap.Database.open(database) as connection:
+        with pycolmap.Database.open(str(database)) as connection:
             if len(new := [name for name in names if not connection.exists_image(name)]) < len(names):
                 reader.existing_camera_id = connection.read_image_with_name((set(names) - set(new)).pop()).camera_id
         if new:
-            pycolmap.import_images(database, root, pycolmap.CameraMode.SINGLE, new, reader)
+            pycolmap.import_images(str(database), str(root), pycolmap.CameraMode.SINGLE, new, reader)
     options = pycolmap.FeatureExtractionOptions(num_threads=config.threads, use_gpu=False)
     every = [name for names in groups for name in names]
     on_cpu = {"extraction_options": options, "device": pycolmap.Device.cpu}
     work = partial(pycolmap.extract_features, database, root, every, **on_cpu)
-    with pycolmap.Database.open(database) as connection:
+    with pycolmap.Database.open(str(database)) as connection:
         numbers = [image.image_id for image in connection.read_all_images()]
         found = lambda: sum(map(connection.exists_keypoints, numbers))  # noqa: E731
         run_watched(database.parent, "features", len(numbers), work, found, config.quiet, stops)
@@ -130,7 +131,7 @@ def write_scene(model: Path, root: Path, scene: Path, part: Path, count: int, co
 def _copy(part: Path, model: Path, root: Path, cancellation_token: object) -> None:
     """Photographs and model as they are, to where undistortion puts its own; too short to be canceled."""
     shutil.copytree(model, part / "sparse")
-    found = pycolmap.Reconstruction(model)
+    found = pycolmap.Reconstruction(str(model))
     for name in (found.image(index).name for index in found.reg_image_ids()):
         (part / "images" / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(root / name, part / "images" / name)
