@@ -50,15 +50,12 @@ class Document:
         self.path = Path(path)
         size = self.path.stat().st_size
         with open(self.path, "rb") as source:
-            binary = source.read(4) == b"glTF"
-            source.seek(0)
-            chunk = None
-            if binary:
+            if source.peek(4)[:4] == b"glTF":
                 text, chunk = self._read_chunks(source, size)
             elif size > JSON_BYTES:
                 raise Unexpected(f"a JSON file of {size} bytes, more than {JSON_BYTES}")
             else:
-                text = source.read()
+                text, chunk = source.read(), None
         self.json = json_object(text)
         if (count := len(entries_of(self.json, "buffers"))) > MOST_BUFFERS:
             raise Unexpected(f"{count} buffers, more than {MOST_BUFFERS}")
@@ -147,15 +144,13 @@ class Document:
             raise Unexpected(f"version {version}")
         if length > size:
             raise ValueError(f"found {size} of {length} bytes")
-        place = HEADER.size
-        while place + CHUNK.size <= length and len(chunks) < 2:  # what follows these two is for others
-            source.seek(place)
+        # what follows these two is for others
+        while (place := source.tell() + CHUNK.size) <= length and len(chunks) < 2:
             chunk_length, kind = CHUNK.unpack(source.read(CHUNK.size))
-            place += CHUNK.size
             if chunk_length > length - place:
                 raise ValueError(f"a chunk of {chunk_length} bytes, of which {length - place} are there")
             chunks[kind] = Buffer(self.path, place, chunk_length)
-            place += chunk_length
+            source.seek(place + chunk_length)
         if (text := chunks.get(b"JSON")) is None or text.length > JSON_BYTES:
             raise Unexpected("no JSON" if text is None else f"JSON of {text.length} bytes, more than {JSON_BYTES}")
         source.seek(text.start)

@@ -89,8 +89,7 @@ def load_spz(path: str | Path, report: Report = print) -> SplatFile:
         InputError: if the file is missing, damaged, of another version, or expands beyond what real files do.
     """
     with reading(path, "an SPZ file of version 2, 3 or 4", *DAMAGE), open(path, "rb") as source:
-        start, file_bytes = source.read(4), os.fstat(source.fileno()).st_size
-        source.seek(0)
+        start, file_bytes = source.peek(4)[:4], os.fstat(source.fileno()).st_size
         if start == MAGIC:
             header, streams, records = _read_zstd(source, file_bytes)
         elif start[:2] == b"\x1f\x8b":
