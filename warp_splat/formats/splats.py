@@ -60,14 +60,12 @@ def finite_rows(splats: SplatArrays, path, report: Report) -> SplatArrays:
 
     One of the first can spoil a whole image. The others would be in none, but formats store them as the identity.
     """
-    count = len(splats.means)
     finite = np.all([np.isfinite(array).all(axis=tuple(range(1, array.ndim))) for array in splats], axis=0)
     finite &= splats.quats.any(axis=1)
     if finite.all():
         return splats
-    report(
-        f"{path}: left out {np.count_nonzero(~finite)} of {count} Gaussians that are not finite or have no rotation."
-    )
+    lost = np.count_nonzero(~finite)
+    report(f"{path}: left out {lost} of {len(finite)} Gaussians that are not finite or have no rotation.")
     return splats.take(finite)
 
 
