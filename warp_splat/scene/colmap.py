@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import struct
 from collections.abc import Callable
 from pathlib import Path
@@ -140,16 +139,12 @@ def _check_length(path: Path, record_end: Callable[[bytes, int], int | None]) ->
         )
 
 
-@functools.cache
-def _known_models() -> dict[int, pycolmap.CameraModelId]:
-    return {int(model): model for model in pycolmap.CameraModelId.__members__.values() if int(model) >= 0}
-
-
 def _camera_end(data: bytes, start: int) -> int | None:
     _, model, width, height = CAMERA.unpack_from(data, start)
-    if model not in _known_models():
+    known = {int(each): each for each in pycolmap.CameraModelId.__members__.values()}
+    if model < 0 or model not in known:
         return None
-    camera = pycolmap.Camera.create_from_model_id(0, _known_models()[model], 1.0, width, height)
+    camera = pycolmap.Camera.create_from_model_id(0, known[model], 1.0, width, height)
     return start + CAMERA.size + 8 * len(camera.params)
 
 
