@@ -25,9 +25,7 @@ FRAME_HEAD = UINT32_PAIR.size + POSE  # bytes; then the number of its images, th
 POINT_HEAD = 43  # bytes of id, position, color, error; then the length of the track, the track
 
 
-def read_colmap(
-    source: Path, folder: str, report: Report, native: bool = False
-) -> tuple[list[Photo], np.ndarray, np.ndarray]:
+def read_colmap(source: Path, folder: str, report: Report, native: bool) -> tuple[list[Photo], np.ndarray, np.ndarray]:
     """Read the largest model under ``source``/sparse and find its images in ``source``/``folder``.
 
     Args:
@@ -46,7 +44,16 @@ def read_colmap(
     if not (registered := registered_images(model)):
         raise InputError(f"{where}: expected a COLMAP model with registered images, found none; run its mapper again.")
     points, colors = _points(model, report)
-    return _photos(where, registered, source / folder, report, make_sampling(native)), points, colors
+    root, sampling = source / folder, make_sampling(native)
+    names = [image.name for image in registered]
+    hint = "copy them there or, to train, choose another folder with --images"
+    paths = ImageFinder(root).find_all(names, f"images of {where}", hint, report)
+    sizes = [images.read_size(path) for path in paths]
+    photos = [photo_of(*each, sampling) for each in zip(registered, paths, sizes, strict=True)]
+    if scaled := sum(size != size_of(image) for size, image in zip(sizes, registered, strict=True)):
+        report(f"Scaling the cameras of {scaled} of {len(photos)} images to the size of the files in {root.name}.")
+    tell_lenses(photos, report)
+    return photos, points, colors
 
 
 def read_tracks(source: Path) -> dict[str, Sightings]:
@@ -179,20 +186,6 @@ def _points(model: pycolmap.Reconstruction, report: Report) -> tuple[np.ndarray,
     if not (finite := np.isfinite(points).all(axis=1)).all():
         report(f"Dropping {np.count_nonzero(~finite)} of {len(points)} points that are not finite.")
     return points[finite], colors[finite]
-
-
-def _photos(
-    where: Path, registered: list[pycolmap.Image], root: Path, report: Report, sampling: Sampling | None
-) -> list[Photo]:
-    names = [image.name for image in registered]
-    hint = "copy them there or, to train, choose another folder with --images"
-    paths = ImageFinder(root).find_all(names, f"images of {where}", hint, report)
-    sizes = [images.read_size(path) for path in paths]
-    photos = [photo_of(*each, sampling) for each in zip(registered, paths, sizes, strict=True)]
-    if scaled := sum(size != size_of(image) for size, image in zip(sizes, registered, strict=True)):
-        report(f"Scaling the cameras of {scaled} of {len(photos)} images to the size of the files in {root.name}.")
-    tell_lenses(photos, report)
-    return photos
 
 
 def size_of(image: pycolmap.Image) -> tuple[int, int]:
