@@ -194,8 +194,7 @@ def _place_picture(
     figure: Figure, box: tuple[float, float, float, float], picture: np.ndarray, title: str, aspect: str = "equal"
 ) -> None:
     """Show ``picture`` in ``box`` = (left, bottom, width, height) [inches], with a title above its left edge."""
-    width, height = figure.get_size_inches()
-    axes = figure.add_axes((box[0] / width, box[1] / height, box[2] / width, box[3] / height))
+    axes = figure.add_axes(tuple(np.divide(box, [*figure.get_size_inches()] * 2)))
     axes.imshow(picture, cmap="inferno", vmin=0, vmax=255, aspect=aspect)
     axes.set_anchor("NW")
     axes.set_axis_off()
@@ -213,10 +212,8 @@ def _draw_scale(figure: Figure, right: float, bottom: float) -> None:
 
 def _write(figure: Figure, left: float, bottom: float, text: str, weight: str = "normal", align: str = "left") -> None:
     """Text that begins, or ends, at a place in inches."""
-    size = 9 if weight == "bold" else 8
-    width, height = figure.get_size_inches()
-    style = {"fontsize": size, "fontweight": weight, "color": INK, "ha": align, "parse_math": False}
-    figure.text(left / width, bottom / height, text, **style)
+    style = {"fontsize": 9 if weight == "bold" else 8, "fontweight": weight, "color": INK, "parse_math": False}
+    figure.text(left, bottom, text, ha=align, transform=figure.dpi_scale_trans, **style)
 
 
 def _shorten(name: str, inches: float) -> str:
