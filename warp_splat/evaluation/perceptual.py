@@ -57,15 +57,14 @@ def choose_metrics(lpips_weights: str) -> tuple[dict[str, Metric], list[str]]:
     else:
         absent.append("FLIP is left out: the package flip-evaluator is not installed (pip install flip-evaluator).")
     if lpips_weights:
-        name, metric = _load_lpips(lpips_weights)
-        metrics[name] = metric
+        metrics |= _load_lpips(lpips_weights)
     else:
         absent.append("LPIPS is left out: no weights were named (--lpips_weights).")
     return metrics, absent
 
 
-def _load_lpips(path: str) -> tuple[str, Metric]:
-    """LPIPS by the network whose weights these are."""
+def _load_lpips(path: str) -> dict[str, Metric]:
+    """LPIPS by the network whose weights these are, by its name."""
     weights = _load_weights(Path(path))
     problem = "--lpips_weights: LPIPS needs the packages lpips and torchvision"
     advice = "; install them with `pip install lpips torchvision`, or leave this flag out."
@@ -91,7 +90,7 @@ def _load_lpips(path: str) -> tuple[str, Metric]:
         with torch.no_grad():
             return float(model(*pair, normalize=signed))
 
-    return name, measure
+    return {name: measure}
 
 
 def _load_weights(path: Path) -> dict[str, Any]:
