@@ -71,8 +71,7 @@ def floaters(splats: SplatArrays, setting: ViewSetting, views: float, near: floa
         total += weight
         squares += weight**2
         nearness += weight * (depth / middle)
-    few = total**2 < views * squares
-    return (few & (nearness < near * total)).cpu().numpy()
+    return ((total**2 < views * squares) & (nearness < near * total)).cpu().numpy()
 
 
 def _draw(opened: Opened, before: SplatArrays, after: SplatArrays, path) -> None:

@@ -114,9 +114,8 @@ def tuned(scene: Scene, file: SplatFile, setting: ViewSetting, count: int, steps
         stage = math.ceil(number / max(1, THINNED * steps / STAGES))
         wanted = max(count, round(total * (count / total) ** (min(stage, STAGES) / STAGES)))
         if wanted < len(trainer.model):
-            keep = _costliest(trainer.model, setting, wanted)
             nothing = {name: rows.detach()[:0] for name, rows in trainer.model.parameters.items()}
-            trainer.optimizer.replace(keep, nothing)
+            trainer.optimizer.replace(_costliest(trainer.model, setting, wanted), nothing)
             trainer.growth.clear()
         trainer.differentiate(degree + number)
         trainer.update(degree + number)
