@@ -14,7 +14,7 @@ from warp_splat.evaluation.metrics import psnr
 from warp_splat.evaluation.report import BLUE, GREEN, ORANGE, new_panels, plain_axes, save_figure
 from warp_splat.formats.files import write_csv
 from warp_splat.formats.model_folder import folder_of, is_file_of_gaussians, read_cfg_args
-from warp_splat.formats.splats import COEFFICIENTS, SplatArrays, sizes
+from warp_splat.formats.splats import COEFFICIENTS, SplatArrays, SplatFile, sizes
 from warp_splat.pruning.opened import Opened, output_of, print_quality, require_some, write, written_bytes
 from warp_splat.pruning.thinning import Thinning, fewer_harmonics, model_of, tuned
 from warp_splat.rendering.changes import largest_change
@@ -63,15 +63,13 @@ def simplify(config: SimplifyConfig) -> int:
         least = opened.psnr(file.splats, views) - config.max_loss
         count = _fewest(total, lambda count: opened.psnr(made(count), views) >= least)
     else:
-        count = _count(config, total, lambda count: written_bytes(output, file._replace(splats=thinning.to(count))))
+        count = _count(config, output, file, thinning.to)
     splats = made(count)
     if not config.tolerance:
         splats = fewer_harmonics(splats, opened.setting, squared_error(opened, splats))
     if config.size and config.steps:  # trained numbers are harder to pack
-        thinning, total = Thinning(splats, opened.setting), len(splats.means)
-        splats = thinning.to(
-            _count(config, total, lambda n: written_bytes(output, file._replace(splats=thinning.to(n))))
-        )
+        thinning = Thinning(splats, opened.setting)
+        splats = thinning.to(_count(config, output, file._replace(splats=splats), thinning.to))
     write(output, opened, splats)
     if config.tolerance:
         measured, bound = changed(splats)
@@ -113,13 +111,14 @@ def _check(config: SimplifyConfig) -> None:
         raise InputError("--steps: training changes all pixels; leave it out where there is a --tolerance.")
 
 
-def _count(config: SimplifyConfig, total: int, size_of: Callable[[int], int]) -> int:
-    """How many of ``total`` Gaussians to keep, for ``--keep`` or ``--size``; ``size_of`` a count, in bytes."""
+def _count(config: SimplifyConfig, output: Path, file: SplatFile, to: Callable[[int], SplatArrays]) -> int:
+    """How many Gaussians of ``file`` to keep, for ``--keep`` or ``--size``; ``to`` gives those of a count."""
+    total = len(file.splats.means)
     if config.keep:
         count = round(config.keep * total)
     else:
         most = bytes_of(config.size)
-        count = _most(total, lambda count: size_of(count) <= most)
+        count = _most(total, lambda count: written_bytes(output, file._replace(splats=to(count))) <= most)
     if not count:
         raise InputError(f"{config.model}: nothing would be left of {total} Gaussians; keep more, or allow more bytes.")
     return count
@@ -196,6 +195,6 @@ def _unseen(config: SimplifyConfig, output: Path) -> int:
     file = finished.file
     order = np.argsort(-sizes(file.splats), kind="stable")
     keep = lambda count: file.splats.take(np.sort(order[:count]))  # noqa: E731
-    count = _count(config, len(order), lambda count: written_bytes(output, file._replace(splats=keep(count))))
+    count = _count(config, output, file, keep)
     write(output, finished, keep(count))
     return 0
