@@ -192,9 +192,8 @@ def render(
             blending = Blending(bins, seen, drawing(chosen), driver, adjoint, dropped)
             return Painted(blend(drawn, color, blending), drawn, blending, certificate)
 
-    (image, alpha, depth), drawn, blending, certificate = (
-        paint(options) if options.tolerance is None else paint_within(paint, options, seen)
-    )
+    painted = paint(options) if options.tolerance is None else paint_within(paint, options, seen)
+    (image, alpha, depth), drawn, blending, certificate = painted
     if background.dim() == 2:
         image = put_behind(image, alpha, background, camera)
     more = {}
