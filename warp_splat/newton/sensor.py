@@ -319,6 +319,5 @@ def gaussian_of_file(path: str | Path, **more: Any) -> Any:
     newton = imported("newton", "newton: expected the package newton; `pip install 'newton>=1.8'`.")
     means, sh, opacities, scales, quats = load_gaussians(path).splats
     coefficients = np.concatenate([sh[:, 0], sh[:, 1:].transpose(0, 2, 1).reshape(len(sh), -1)], 1)
-    return newton.Gaussian(
-        means, unit_quats(quats)[:, [1, 2, 3, 0]], np.exp(scales), sigmoid(opacities), coefficients, **more
-    )
+    rotations = unit_quats(quats)[:, [1, 2, 3, 0]]
+    return newton.Gaussian(means, rotations, np.exp(scales), sigmoid(opacities), coefficients, **more)
