@@ -3,7 +3,6 @@
 A program writes PNG or EXR. A page, in a headless Chromium, shows the file from a camera.
 """
 
-import functools
 import json
 import os
 import re
@@ -13,7 +12,7 @@ import subprocess
 import tempfile
 import threading
 from collections.abc import Callable
-from functools import partial
+from functools import cache, partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
@@ -104,14 +103,14 @@ class _Handler(SimpleHTTPRequestHandler):
         pass
 
 
-@functools.cache
+@cache
 def _playwright():
     """Started once: after a browser that could not be started, a second start would raise something else."""
     problem = "playwright: it drives the browser, and is not there; pip install playwright."
     return imported("playwright.sync_api", problem).sync_playwright().start()
 
 
-@functools.cache
+@cache
 def _browser():
     """Playwright's browser, the folder that is served, and its address."""
     started, folder = _playwright(), Path(tempfile.mkdtemp())

@@ -1,9 +1,8 @@
 """Small scenes with answers that are known, and those of the catalog of stiff cases that anyone could draw."""
 
-import functools
 import re
 from collections.abc import Callable
-from functools import partial
+from functools import cache, partial
 
 import numpy as np
 import torch
@@ -75,7 +74,7 @@ def _hair() -> Drawn:
     return _balls(np.stack([x, y], 1), np.linspace(2, 5, 24), 7.0, 0.6, colors)
 
 
-@functools.cache
+@cache
 def _trained() -> Drawn:
     """After 300 steps with pictures of 64 px, seen in a view that was held out, at half their size."""
     scene = load_scene(embedded_scene(), resolution=SIZE[0], eval=True, report=lambda *_: None)

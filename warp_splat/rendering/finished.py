@@ -17,8 +17,7 @@ from warp_splat.formats.exposures import Exposures, read_exposures
 from warp_splat.formats.model_folder import folder_of, open_model, read_environment, read_refined, trained_names
 from warp_splat.formats.splats import SplatFile
 from warp_splat.gaussians import GaussianModel
-from warp_splat.raster.api import RenderOutput
-from warp_splat.raster.api import render as render_gaussians
+from warp_splat.raster.api import RenderOutput, render
 from warp_splat.raster.expose import expose
 from warp_splat.scene import load_scene
 from warp_splat.scene.decoding import photo_memory
@@ -165,7 +164,7 @@ def make_renderer(
 
     @torch.no_grad()
     def draw(camera: Camera, depth: bool = False, median: bool = False) -> RenderOutput:
-        return render_gaussians(gaussians, camera, behind, replace(options, depth=depth, median_depth=median))
+        return render(gaussians, camera, behind, replace(options, depth=depth, median_depth=median))
 
     return draw
 
