@@ -172,6 +172,32 @@ def test_ctrl_c_stops_all_after_the_same_step(tmp_path):
     assert len(load_ply(ply_path(tmp_path, entry["iterations"])).splats.means) == 4500
 
 
+#: Training in which process 1 has options of its own.
+OTHERS = """
+import os, sys
+from warp_splat.cli import main
+sys.exit(main(["train", *sys.argv[1:], *(OPTIONS if os.environ["RANK"] == "1" else [])]))
+"""
+
+
+@pytest.mark.parametrize(
+    ("options", "found"),
+    [
+        pytest.param(["--seed", "3"], "the same seed as of process 0, 0, got 3", marks=pytest.mark.slow),
+        pytest.param(["--no-shard"], "the same shard as of process 0, True, got False", marks=pytest.mark.long),
+        pytest.param(["--eval"], "the same photographs as of process 0", marks=pytest.mark.long),
+    ],
+)
+def test_other_options_of_a_process_are_told_before_the_first_step(options, found, tmp_path):
+    """With --shard, models cannot be compared."""
+    script = tmp_path / "others.py"
+    script.write_text(OTHERS.replace("OPTIONS", str(options)))
+    given = ["--shard", "-s", SCENE, "-m", tmp_path / "model", "-r", "8", "--iterations", "20", "--quiet"]
+    run = python(*TORCHRUN, script, *given, check=False)
+    assert run.returncode != 0 and f"Process 1: expected {found}" in run.stderr
+    assert not list((tmp_path / "model").rglob("*"))
+
+
 @pytest.mark.slow
 def test_a_whole_run_of_two_processes(tmp_path):
     """The options of test_train.py's short run, and every part that learns; after every densification the models, and

@@ -10,7 +10,7 @@ import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import timedelta
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -121,6 +121,13 @@ class Processes:
                 f"iterations, found SHA-256 {', '.join(names)} (rank 0, 1, ...); give all the same scene, processors "
                 "or GPUs of one kind, and the same versions of torch and Warp."
             )
+
+    def check_alike(self, facts: dict[str, Any]) -> None:
+        """Compare what holds for this process with what does for the first. Raises GroupError if that differs."""
+        theirs = self.first(facts)
+        for name in filter(lambda name: facts[name] != theirs[name], facts):
+            expected = f"expected the same {name} as of process 0, {theirs[name]!r:.80}, got {facts[name]!r:.80}"
+            raise GroupError(f"Process {self.rank}: {expected}; start all with the same options and scene.")
 
     def own(self, count: int) -> slice:
         """Which of ``count`` rows belong to this process."""

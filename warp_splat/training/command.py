@@ -97,6 +97,9 @@ def _train(config: TrainConfig, processes: Processes) -> int:
     say = opening.speaker(config.report.quiet)
     run = Run(Path(config.report.model_path), time.perf_counter())
     scene = opening.open_scene(config, begun, say, processes.local_count)
+    own = {*vars(config.data), *vars(config.report), *vars(config.machine)} - {"shard"}  # what may differ
+    facts = {name: value for name, value in config.flat().items() if name not in own}
+    processes.check_alike(facts | {"photographs": [view.name for view in scene.train]})
     if config.learn.minutes and not begun:
         config = plan_training(scene, config, processes, say)
     config, weighed = settle_parts(config, scene, processes, say)
