@@ -77,6 +77,22 @@ def test_the_terms_are_those_written_out(scene, tmp_path):
     np.testing.assert_allclose(part.kept[3], nearness[np.int64(rows)[:, None], np.int64(columns)], rtol=1e-4, atol=1e-6)
 
 
+def test_what_is_masked_does_not_count(scene, tmp_path):
+    trainer, _ = stepped(scene, tmp_path, 30, **SURFACE)
+    part, view, step = trainer.parts[0], scene.train[3], Step(50, scene.train[3])
+    photograph = trainer.photographs.at_size(view, 50)[1]
+    mask = torch.ones(*photograph.image.shape[:2], 1, dtype=torch.uint8)
+    half = mask.shape[1] // 2
+    mask[:, :half] = 0
+    for given, inside in ((None, True), (mask, False)):
+        part.photograph(photograph._replace(mask=given), step)
+        out = looked(trainer, view)
+        part.loss(torch.zeros(()), out, step).backward()
+        for plane in LEARNED(out):  # depths beside a pixel that counts are looked at
+            assert plane.grad[:, : half - 2].any() == inside and plane.grad[:, half:].any()
+        assert part.kept[3, :, :48].any() == inside and part.kept[3, :, 80:].any()
+
+
 def test_gradients(scene, tmp_path):
     """Of normals, by finite differences; of depths, along the other camera's axis, as far as they are looked up."""
     trainer, _ = stepped(scene, tmp_path, 30, **{**SURFACE, "surface_views": 0.0})

@@ -19,6 +19,7 @@ from warp_splat.raster.beside import rays
 from warp_splat.runtime.timers import stage
 from warp_splat.scene.neighbors import distances
 from warp_splat.training.parts import SurfaceOptions
+from warp_splat.training.photographs import Photograph
 from warp_splat.training.seams import Setting, Step
 
 BEGIN = 0.25  # share of the steps after which it counts
@@ -31,6 +32,8 @@ SIZE = 128  # edge of the map of depths that is kept of each view
 
 class SurfacePart:
     """Adds 1 - the cosine between both normals, and the relative difference of depths: their means, weighted."""
+
+    mask: torch.Tensor | None = None  # of the photograph of the step
 
     def __init__(self, options: SurfaceOptions, setting: Setting):
         self.options, self.extent, self.begin = options, setting.scene.extent, BEGIN * setting.iterations
@@ -46,6 +49,11 @@ class SurfacePart:
         """Normals and planes, also to warm up."""
         return replace(options, normals=True) if step.iteration >= self.begin or not step.iteration else options
 
+    def photograph(self, photograph: Photograph, step: Step) -> Photograph:
+        """Note what of it counts."""
+        self.mask = photograph.mask
+        return photograph
+
     def loss(self, loss: torch.Tensor, out: RenderOutput, step: Step) -> torch.Tensor:
         """Add both terms, and keep the depths."""
         if out.normals is None or out.planes is None:
@@ -60,6 +68,8 @@ class SurfacePart:
             seen = (alpha > OPAQUE) & (slope < -GRAZING * alpha) & (plane < 0)
             depth = torch.where(seen, plane, -1.0) / torch.where(seen, slope, -1.0)
             points = ray * depth[..., None]
+            if self.mask is not None:
+                seen = seen & (self.mask[counting][..., 0] > 0)
             unlike = torch.where(seen[1:-1, 1:-1], _unlike(points, normals, alpha), 0.0)
             added = self.options.surface_normals * _mean(unlike)
             apart = distances([camera], self.cameras, self.extent)[0]
