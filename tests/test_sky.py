@@ -20,6 +20,7 @@ from warp_splat.formats.model_folder import ply_path, read_environment, write_cf
 from warp_splat.gaussians import GaussianModel
 from warp_splat.lenses import Lens
 from warp_splat.raster.behind import put_behind
+from warp_splat.raster.camera_parameters import CameraParameters
 from warp_splat.scene import load_scene
 from warp_splat.scene.horizon import share_of_sky
 from warp_splat.scene.types import Decoded
@@ -47,6 +48,19 @@ def test_what_is_saved_looks_as_in_training(trained, scene):
     trainer.model = trainer.model.arranged()
     found = picture_of(trainer.model, trainer.behind, trainer.options)(camera)
     assert np.array_equal(shown, found) and not np.array_equal(shown, without)
+
+
+def test_behind_a_rolling_shutter_each_row_sees_its_own_sky(scene):
+    """Also one that learns, and through a lens."""
+    last = Rotation.from_rotvec([0.05, 0.3, 0.1]).as_matrix()
+    harmonics = 0.5 * torch.randn(16, 3, generator=torch.Generator().manual_seed(0))
+    for lens in (None, Lens("OPENCV_FISHEYE", (0.05, 0.0, 0.0, 0.0))):
+        first = replace(scene.train[0].camera, lens=lens)
+        camera = Camera.rolling(first, replace(first, rotation=last @ first.rotation))
+        image, alpha = torch.zeros(camera.height, camera.width, 3), torch.zeros(camera.height, camera.width)
+        rows = [put_behind(image, alpha, harmonics, camera.at(row))[row] for row in range(camera.height)]
+        for shown in (camera, CameraParameters(camera)):
+            np.testing.assert_allclose(put_behind(image, alpha, harmonics, shown), torch.stack(rows), atol=2e-6)
 
 
 def test_it_is_gray_at_first_and_learns_the_color_of_what_gaussians_do_not_cover(scene, tmp_path):

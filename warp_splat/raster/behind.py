@@ -11,6 +11,7 @@ from warp_splat.camera import Camera
 from warp_splat.kernels.environment import RUN, make_adj_put_behind, make_put_behind
 from warp_splat.kernels.simd import vec48
 from warp_splat.lenses import Lens
+from warp_splat.lenses.shutter import rotated
 from warp_splat.raster.camera_parameters import CameraParameters
 from warp_splat.raster.drivers import driver_of
 from warp_splat.runtime.launch import launch_in_lanes, load, view
@@ -33,7 +34,8 @@ def put_behind(
             of its base.
     """
     base, pose = (camera.base, camera.camera) if isinstance(camera, CameraParameters) else (camera, camera)
-    rays, blind = _rays(base.width, base.height, base.fx, base.fy, base.cx, base.cy, base.lens, image.device)
+    intrinsics = base.width, base.height, base.fx, base.fy, base.cx, base.cy
+    rays, blind = _rays(*intrinsics, base.lens, pose.shutter.turn if pose.shutter else (), image.device)
     if blind is not None:
         alpha = alpha.masked_fill(blind, 1.0)
     with stage("environment"):
@@ -48,14 +50,20 @@ def load_kernels(device: torch.device) -> None:
 
 @functools.lru_cache(maxsize=KEPT)
 def _rays(
-    width: int, height: int, fx: float, fy: float, cx: float, cy: float, lens: Lens | None, device: torch.device
+    width: int, height: int, fx: float, fy: float, cx: float, cy: float, lens: Lens | None, turn, device: torch.device
 ) -> tuple[torch.Tensor, torch.Tensor | None]:
-    """What the pixels of a camera see, [H * W, 3] float32 in its axes; and which see nothing, [H, W], if any."""
+    """What the pixels of a camera see, [H * W, 3] float32 in its axes; and which see nothing, [H, W], if any.
+
+    With the ``turn`` of a rolling shutter, in the axes of its middle.
+    """
     x, y = (np.arange(width) + 0.5 - cx) / fx, (np.arange(height) + 0.5 - cy) / fy
     places = np.stack(np.broadcast_arrays(x, y[:, None]), -1).reshape(-1, 2)
     rays = lens.undistorted(places) if lens else np.concatenate([places, np.ones((len(places), 1))], 1)
     blind = ~np.isfinite(rays).all(1)
     rays[blind] = (0.0, 0.0, 1.0)
+    for row in range(height) if turn else ():
+        back = (0.5 - (row + 0.5) / height) * np.array(turn)[:, None]
+        rays[row * width : (row + 1) * width] = rotated(rays[row * width : (row + 1) * width].T, back, 1).T
     found = torch.from_numpy(rays.astype(np.float32)).to(device)
     return found, torch.from_numpy(blind.reshape(height, width)).to(device) if blind.any() else None
 
