@@ -120,6 +120,7 @@ WRONG = {
     "expected the number of blocks of": ((0, 1), spoil('"cells": [', '"cells": [[[0, 0, 0], [1, 1, 1]], ')),
     "expected the cells of": ((0, 1), spoil("3.4", "3.1")),
     "expected the antialiasing of": ((0, 1), spoil("antialiasing=False", "antialiasing=True", "cfg_args")),
+    "expected the eval of": ((0, 1), spoil("eval=True", "eval=False", "cfg_args")),
     "expected the origin of": ((0, 1), lambda folder: write_coordinates(folder / "1", {"origin": [1.0, 2.0, 3.0]})),
     "cfg_args: could not be read (No such file or directory)": (
         (0, 1),
@@ -148,7 +149,8 @@ def test_all_blocks_by_one_command_are_those_of_many(trained, tmp_path, capsys, 
         interrupt(patch, 10)
         assert train(tmp_path, *all_of_it) == 130
     assert "goes on with block 2/2" in capsys.readouterr().out
-    for other, found in {"--blocks 3": "block 1/3", "-w": "white_background True", "-r 2": "resolution 2"}.items():
+    others = {"--blocks 3": "block 1/3", "-w": "white_background True", "-r 2": "resolution 2"}
+    for other, found in (others | {"--antialiasing": "antialiasing True"}).items():
         words = ("train", "-s", SCENE, "-m", tmp_path, *SHORT, *all_of_it, *other.split())
         assert f"1: expected a block of --{found}" in fails(*words)
     options = tmp_path / "1" / "cfg_args"

@@ -26,7 +26,7 @@ BLOCK = "block.json"  # in the folder of a training that has ended
 SHARE = 0.1  # of what a photograph shows, for a block to train on it
 SOME = 1000  # points of a block that tell what a photograph shows
 ENDLESS = float(np.finfo(np.float32).max)  # where a cell has no neighbor; JSON has no infinity
-COMMON = ("antialiasing", "projection", "white_background")  # options of which a model has one
+COMMON = ("antialiasing", "projection", "white_background", "eval")  # options of which a model has one
 
 
 class Block(NamedTuple):

@@ -18,7 +18,7 @@ from warp_splat.raster.selftest import settle_device
 from warp_splat.runtime import pool
 from warp_splat.runtime.distributed import Processes
 from warp_splat.scene import load_scene
-from warp_splat.scene.blocks import BLOCK
+from warp_splat.scene.blocks import BLOCK, COMMON
 from warp_splat.scene.decoding import photo_memory
 from warp_splat.scene.embedded import embedded_scene
 from warp_splat.scene.photos import scene_of
@@ -106,7 +106,7 @@ def refuse_other_block(config: TrainConfig, folder: Path) -> None:
     source = config.data.source_path
     source = str(scene_of(Path(source))) if config.data.sfm else source or embedded_scene()
     now = config.flat() | {"source_path": source}
-    for name in (*OF_SCENE, "seed", "source_path", "start_ply"):
+    for name in (*OF_SCENE, *COMMON, "seed", "source_path", "start_ply"):
         there, here = before.get(name, now[name]), now[name]
         if name in ("source_path", "start_ply"):
             there, here = (path and os.path.realpath(path) for path in (str(there), here))
