@@ -2,6 +2,7 @@
 
 import socket
 from contextlib import contextmanager, nullcontext
+from dataclasses import replace
 from importlib.metadata import version
 
 import numpy as np
@@ -15,10 +16,12 @@ from splat_files import small_splats
 from warp_splat.cli import parse
 from warp_splat.color import to_srgb
 from warp_splat.config import RasterOptions, ViewConfig
+from warp_splat.errors import InputError
 from warp_splat.formats.exchange import save_gaussians
 from warp_splat.formats.splats import SplatFile
 from warp_splat.gaussians import GaussianModel
 from warp_splat.rendering.finished import make_renderer
+from warp_splat.scene.types import Stored
 from warp_splat.viewer import server
 from warp_splat.viewer.command import view_model
 from warp_splat.viewer.watcher import MOST
@@ -114,6 +117,21 @@ def test_a_training_camera_and_its_photograph(viewer, monkeypatch):
     client.moved()
     drawn(viewer)
     assert not np.array_equal(client.frames[-1][0][:, 30:90], view.image)  # no longer there: no photograph
+
+
+def test_a_photograph_that_cannot_be_read_is_told_and_ends_nothing(viewer, monkeypatch):
+    at_rest(monkeypatch)
+    client, looks = entered(viewer, size=(120, 60)), viewer.watchers[1]
+
+    def read():
+        raise InputError("0.png: expected a complete image file, found none.")
+
+    viewer.views["0.png"] = replace(viewer.views["0.png"], photograph=Stored(read, False, False, False))
+    looks.opacity.value = 1.0
+    looks.steps.call(value="next")
+    assert drawn(viewer) >= 1 and "complete image file" in looks.note.content
+    looks.steps.call(value="next")
+    assert drawn(viewer) >= 1 and client.frames and "complete image file" not in looks.note.content
 
 
 def picture_of(viewer, camera):

@@ -157,7 +157,9 @@ class Viewer:
         try:
             camera, view, box = watcher.camera(watcher.pixels if moving else MOST)
             watcher.ruler.answer(self.draw_camera, camera, self.unit)
-        except InputError:  # a window that was folded up, which will send another camera when it opens; or a lens
+            photograph = view.picture if view is not None and watcher.opacity.value > 0 else None
+        except InputError as error:  # of a window that was folded up, a lens, or a photograph that cannot be read
+            watcher.note.content = str(error)
             return
         kind = watcher.kind.value
         out = self.draw_camera(camera, kind == "depth")
@@ -165,8 +167,8 @@ class Viewer:
             name = view.name.removesuffix(AS_GIVEN)
             out.image[box] = as_photographed(out.image[box].clone(), self.exposures(), name)
         frame, note = paint(out, kind, self.linear)
-        if view is not None and watcher.opacity.value > 0:
-            frame = overlay(frame, view.picture, box, watcher.opacity.value)
+        if photograph is not None:
+            frame = overlay(frame, photograph, box, watcher.opacity.value)
         if watcher.client.client_id not in self.watchers:
             return
         quality = MOVING_QUALITY if moving else SHARP_QUALITY
