@@ -324,7 +324,7 @@ def test_convex_pieces(model, scene, tmp_path, ending):
         (["ball.ply", "--voxel", "0.0001"], "--voxel 0.0001: nothing is seen at this size"),
         (["ball.ply", "--voxel", "0.0001", "--watertight"], "--voxel 0.0001: nothing is seen at this size"),
         (["ball.ply", "--voxel", "9", "--watertight"], "--voxel 9: nothing is seen at this size"),
-        (["mesh.ply", "--memory", "1e-9"], "--memory: views of 16 px and more do not fit"),
+        (["mesh.ply", "--memory", "1e-9"], "expected views of 16 px and more, found 0; train on larger photographs"),
     ],
 )
 def test_sentences(model, scene, capsys, monkeypatch, tmp_path, arguments, said):

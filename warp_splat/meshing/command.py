@@ -66,7 +66,8 @@ def mesh(config: MeshConfig) -> int:
     voxel, voxels = _grid(config, natural, views, memory / 2)
     surface = surface_in(voxels, views, voxel, config.watertight)
     if not (found := len(surface.faces)):
-        raise InputError(f"--voxel {voxel:g}: no surface goes through voxels of this size; try {natural:.2g}.")
+        smaller = min(natural, voxel / 2)
+        raise InputError(f"{config.model}: no surface crosses voxels of {voxel:.3g}; try --voxel {smaller:.2g}.")
     if 0 < config.triangles < found:
         surface = simplified(surface, config.triangles)
     if config.crop:  # smoothing and simplifying move vertices
@@ -94,8 +95,9 @@ def drawn_views(opened: Opened, memory: float) -> list[Drawn]:
     background = setting.background if setting.background.ndim == 1 else setting.background.new_zeros(3)
     cameras = [view.camera for view in opened.scene.train]
     share = min(1.0, math.sqrt(memory / PIXEL / sum(camera.width * camera.height for camera in cameras)))
-    if share * min(min(camera.width, camera.height) for camera in cameras) < LEAST:
-        raise InputError(f"--memory: views of {LEAST} px and more do not fit into half of it; raise it.")
+    if (edge := share * min(min(camera.width, camera.height) for camera in cameras)) < LEAST:
+        larger = "train on larger photographs, or raise --memory"
+        raise InputError(f"{opened.path}: expected views of {LEAST} px and more, found {edge:.0f}; {larger}.")
     with torch.no_grad():
         gaussians = GaussianModel.from_splats(opened.file.splats).to(background.device).activated()
         for view, camera in zip(opened.scene.train, cameras, strict=True):
