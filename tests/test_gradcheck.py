@@ -6,7 +6,7 @@ import torch
 from hostile import refusal
 from scenes import SCENES
 
-from warp_splat import RasterOptions, check_gradients
+from warp_splat import CameraParameters, RasterOptions, check_gradients
 from warp_splat.compare import oracle
 from warp_splat.config import ADJOINTS
 from warp_splat.raster import blend, differences, project
@@ -180,6 +180,13 @@ def test_boxes_grow_as_the_projection_says():
     grown = thin.splats.extents * differences._growth(thin, "conics", step)
     assert (grown / thick.splats.extents - 1)[drawn].abs().max() < 2e-5
     assert (thick.splats.extents / thin.splats.extents - 1)[drawn].max() > 1e-3
+
+
+def test_of_a_panorama_that_learns_poses_are_checked():
+    """Its intrinsics are fixed by its size."""
+    scene = SCENES["panorama"]()
+    report = check_gradients(*scene.parameters(), CameraParameters(scene.camera), directions=2)
+    assert report.ok and [row.name for row in report.rows[-2:]] == ["rotation", "translation"]
 
 
 def test_deterministic_and_seeded():

@@ -11,7 +11,7 @@ from scenes import SCENES, SHUTTER, one_gaussian, scene_of
 from scipy.spatial.transform import Rotation
 from test_rasterize import relative_error, run, truth
 
-from warp_splat import Camera, InputError, RasterOptions, Shutter, rasterize
+from warp_splat import Camera, CameraParameters, InputError, RasterOptions, Shutter, rasterize
 from warp_splat.compare.truth import for_oracle
 from warp_splat.formats import model_folder
 from warp_splat.kernels.project import affine
@@ -167,6 +167,17 @@ def test_two_poses_make_a_shutter():
 def test_bad_input(make, message):
     with pytest.raises(InputError, match=message):
         make(SCENES["single"]().camera)
+
+
+def test_two_poses_at_the_limits_make_a_camera_that_learns():
+    """Put together of them again, it is a bit beyond."""
+    rolling = scene_of("rolling single").camera
+    for axis in np.random.default_rng(0).normal(size=(40, 3)):
+        turn = axis / np.linalg.norm(axis)
+        half = turn * 0.5 * rolling.height / rolling.fy / abs(turn[0])
+        for most in (turn, half)[: 1 + (np.linalg.norm(half) < 1)]:
+            if abs(most[0]) * rolling.fy / rolling.height <= 0.5:
+                CameraParameters(replace(rolling, shutter=Shutter(tuple(most))))
 
 
 def test_a_projection_of_ones_own_knows_no_shutter():

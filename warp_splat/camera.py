@@ -10,7 +10,7 @@ import numpy as np
 
 from warp_splat.errors import InputError
 from warp_splat.lenses import Lens, angle_of_view, check_picture
-from warp_splat.lenses.shutter import Shutter, rotation_vector
+from warp_splat.lenses.shutter import ROUNDED, Shutter, rotation_vector
 
 MOST_SHARE = 0.5  # of its height by which a picture may move up or down while it is read
 
@@ -92,7 +92,7 @@ class Camera:
                     f"Camera lens {self.lens.model}: expected a picture of 2:1, got {self.width} x {self.height} "
                     "pixels; use one that shows all around."
                 )
-        if self.shutter and (share := abs(self.shutter.turn[0]) * self.fy / self.height) > MOST_SHARE:
+        if self.shutter and (share := abs(self.shutter.turn[0]) * self.fy / self.height) > MOST_SHARE + ROUNDED:
             raise InputError(
                 "Camera shutter: expected a turn that moves the picture up or down by at most half of its height "
                 f"while it is read, got {share:.2f}; check fy and the poses."
@@ -102,7 +102,8 @@ class Camera:
     def rolling(cls, first: Camera, last: Camera) -> Camera:
         """``first`` with a rolling shutter: from its pose, when its first row is read, to that of ``last``.
 
-        The center moves on a line at one speed, the rotation about one axis (:class:`warp_splat.Shutter`).
+        The center moves on a line at one speed, the rotation about one axis (:class:`warp_splat.Shutter`). Of ``last``
+        only the pose counts.
 
         Raises:
             InputError: if it turns by more than a radian, or moves the picture by more than half its height.

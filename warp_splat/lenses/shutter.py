@@ -7,6 +7,7 @@ import numpy as np
 
 from warp_splat.errors import InputError
 
+ROUNDED = 1e-9  # of a turn that was put together of two poses
 MOST_TURN = 1.0  # rad from the first row to the last; kernels' series know no more
 TERMS = 16  # of the power series: up to half a turn to the last bit, a whole turn to 3e-11
 
@@ -39,7 +40,7 @@ class Shutter:
             if len(numbers) != 3 or not all(math.isfinite(number) for number in numbers):
                 raise InputError(f"Shutter {part.name}: expected three finite numbers, got {given!r:.80}.")
             object.__setattr__(self, part.name, numbers)
-        if math.hypot(*self.turn) > MOST_TURN:
+        if math.hypot(*self.turn) > MOST_TURN + ROUNDED:
             raise InputError(
                 f"Shutter turn: expected at most {MOST_TURN:g} rad from the first row to the last, got "
                 f"{math.hypot(*self.turn):.3g}; check the unit and the poses."

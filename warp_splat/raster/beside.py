@@ -63,7 +63,7 @@ def blend_beside(
         numbers, weights, median_depth = find_strongest(splats, blending)
         if options.strongest:
             owners = with_copies(torch.arange(len(gaussians.means), device=splats.means2d.device), crossing)
-            numbers = torch.where(numbers < 0, numbers, owners[numbers]) if crossing else numbers
+            numbers = torch.where(numbers < 0, numbers, owners[numbers]) if crossing and len(owners) else numbers
             found |= {"strongest": numbers, "strongest_weights": weights}
         if options.median_depth:
             found["median_depth"] = median_depth

@@ -10,7 +10,8 @@ from warp_splat.camera import Camera
 from warp_splat.lenses import Lens
 from warp_splat.raster.camera_parameters import CameraParameters
 
-CAMERA = ("rotation", "translation", "focal", "principal")  # halves of the twist and of the intrinsics
+INTRINSICS = ("focal", "principal")  # halves of the intrinsics
+CAMERA = ("rotation", "translation", *INTRINSICS)  # and of the twist
 LAST_ROW = ("last_rotation", "last_translation")  # of the last twist, where there is a rolling shutter
 LENS = "coefficients"  # if they are learned
 SMALL = 1e-4  # change of a coefficient that tells how far a picture moves with it

@@ -30,7 +30,7 @@ from warp_splat.camera import Camera
 from warp_splat.config import RasterOptions
 from warp_splat.raster.api import RenderOutput, render
 from warp_splat.raster.camera_parameters import CameraParameters
-from warp_splat.raster.camera_parts import natural_size, parts_of, put_together
+from warp_splat.raster.camera_parts import INTRINSICS, natural_size, parts_of, put_together
 from warp_splat.raster.data import Gaussians, Splats2D
 from warp_splat.raster.project import project
 
@@ -74,8 +74,9 @@ class Trial:
 
 
 def inputs_of(camera: Camera | CameraParameters) -> tuple[str, ...]:
-    """The names of what is given: of the Gaussians, and of a camera that learns."""
-    return *INPUTS, *parts_of(camera)
+    """The names of what is given: of the Gaussians, and of a camera that learns; a panorama's intrinsics are fixed."""
+    around = isinstance(camera, CameraParameters) and camera.base.lens and camera.base.lens.family.around
+    return *INPUTS, *(name for name in parts_of(camera) if not (around and name in INTRINSICS))
 
 
 class MovableScene:
