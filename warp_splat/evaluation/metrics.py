@@ -3,7 +3,6 @@
 Both are those of the reference's ``metrics.py`` (Kerbl et al. 2023), in float64. CC_PSNR is PSNR after a fit of colors.
 """
 
-import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -88,7 +87,7 @@ def cc_psnr(image: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = 
 
 def _decibels(squares: np.ndarray) -> float:
     error = np.mean(squares)
-    return float(-10 * np.log10(error)) if error > 0 else math.inf
+    return float(-10 * np.log10(error)) if error > 0 else np.inf
 
 
 def _unsaturated(values: np.ndarray) -> np.ndarray:

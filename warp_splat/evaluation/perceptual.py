@@ -4,7 +4,6 @@ FLIP (Andersson et al. 2020) is made for renders and needs no weights. LPIPS (Zh
 network that was trained on photographs. Its package would download them; here they are read from disk.
 """
 
-import math
 import warnings
 from importlib.util import find_spec
 from pathlib import Path
@@ -84,7 +83,7 @@ def _load_lpips(path: str) -> dict[str, Metric]:
 
     def measure(image: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = None) -> float:
         if min(image.shape[:2]) < SMALLEST:
-            return math.nan
+            return np.nan
         arrays = masked(mask, *unit_images(image, reference))
         pair = [torch.from_numpy(array.astype(np.float32)).permute(2, 0, 1)[None] for array in arrays]
         with torch.no_grad():

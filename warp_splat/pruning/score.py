@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
-import numpy as np
 import torch
 
 from warp_splat.config import RasterOptions
@@ -79,7 +78,7 @@ def costs(model: GaussianModel, setting: ViewSetting) -> Costs:
     """
     with torch.no_grad():
         gaussians = model.activated()
-    degrees = int(np.sqrt(1 + gaussians.sh_rest.shape[1])) - 1
+    degrees = int((1 + gaussians.sh_rest.shape[1]) ** 0.5) - 1
     whole = torch.zeros(len(model), dtype=torch.float64, device=model.device)
     harmonics = torch.zeros(len(model), degrees, dtype=torch.float64, device=model.device)
     for number, view in enumerate(setting.views):
