@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 import OpenImageIO as oiio
 import torch
-from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from tqdm import tqdm
 
@@ -62,7 +61,7 @@ def save_scaled(path: Path, values: np.ndarray) -> None:
     figure = Figure(figsize=(width / DPI + 1.0, height / DPI), dpi=DPI)
     axes = figure.add_axes((0.0, 0.0, width / (width + DPI), 1.0))
     axes.set_axis_off()
-    shown = axes.imshow(values.clip(*SCALE), norm=LogNorm(*SCALE), cmap="turbo", aspect="auto")
+    shown = axes.imshow(values.clip(*SCALE), norm="log", vmin=SCALE[0], vmax=SCALE[1], cmap="turbo", aspect="auto")
     figure.colorbar(shown, cax=figure.add_axes(((width + 0.1 * DPI) / (width + DPI), 0.05, 0.2 * DPI / width, 0.9)))
     save_figure(figure, path)
 
@@ -231,8 +230,7 @@ def _film(picture: Callable[[Camera], np.ndarray], cameras: list[Camera], output
         if (older := len(list(folder.glob("[0-9]" * 5 + ".png"))) - len(cameras)) > 0:
             print(f"Warning: {older} older frames are in {folder}, too.")
     else:
-        for _ in frames:
-            pass
+        list(frames)
     if output:
         print(f"  frames in {output}")
 
