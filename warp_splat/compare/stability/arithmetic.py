@@ -42,10 +42,7 @@ def exact_loss(image: torch.Tensor, target: torch.Tensor, share: float = 0.2) ->
 def loss(scale: float, noise: float, _mode: str) -> Outcome:
     """Value and gradient of the training loss on ``scale`` times (a constant, plus ``noise`` of the image)."""
     generator = torch.Generator().manual_seed(3)
-    base = torch.ones(32, 40, 3)
-    image, target = (
-        scale * (level * base + noise * torch.rand(base.shape, generator=generator)) for level in (0.4, 0.5)
-    )
+    image, target = (scale * (level + noise * torch.rand(32, 40, 3, generator=generator)) for level in (0.4, 0.5))
     leaf, exact = image.clone().requires_grad_(), image.double().requires_grad_()
     value, truth = image_loss(leaf, target), exact_loss(exact, target.double())
     value.backward()
