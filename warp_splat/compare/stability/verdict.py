@@ -234,7 +234,6 @@ def judge(expected: Expected, mode: str) -> Outcome:
     errors = {name: relative_error(value, expected.gradients[name], problem.gain) for name, value in gradients.items()}
     worst = max(errors, key=lambda name: errors[name] / expected.gradient_limits[name])
     off = [(name, errors[name], limit) for name, limit in expected.gradient_limits.items()]
-    hidden = out.radii[list(problem.left_out)]
     dropped, dropped_now = int(expected.overflows.sum()), out.dropped.gaussians
     statements = [
         (out.image.isfinite().all() and out.alpha.isfinite().all(), "image not finite"),
@@ -243,7 +242,7 @@ def judge(expected: Expected, mode: str) -> Outcome:
         (value_error < expected.image_limit, f"image off by {value_error:.1e} > {expected.image_limit:.1e}"),
         (not (error[~sure] > share).any(), "image off by more than one Gaussian at a fragile pixel"),
         *((error < limit, f"gradient of {name} off by {error:.1e} > {limit:.1e}") for name, error, limit in off),
-        (not hidden.any(), "drawn although it should be left out"),
+        (not out.radii[list(problem.left_out)].any(), "drawn although it should be left out"),
         (out.invalid == problem.invalid, f"counted {out.invalid} invalid, not {problem.invalid}"),
         (dropped_now == dropped, f"dropped gradients of {dropped_now} Gaussians, not {dropped}"),
         (out.dropped.pixels == 0, f"dropped {out.dropped.pixels} pixels"),
