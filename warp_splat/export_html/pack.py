@@ -63,9 +63,8 @@ def parts(splats: SplatArrays, origin: np.ndarray, coarse: SplatArrays | None = 
         origin: the point [3] that positions are relative to, world units.
         coarse: CHUNK others of degree 0, which become the first part.
     """
-    chunks = [splats.take(slice(start, start + CHUNK)) for start in range(0, max(1, len(splats.means)), CHUNK)]
-    if coarse is not None:
-        chunks = [coarse, *chunks]
+    chunks = [] if coarse is None else [coarse]
+    chunks += [splats.take(slice(start, start + CHUNK)) for start in range(0, max(1, len(splats.means)), CHUNK)]
     found = {f"gaussians{index}": _compressed(_core(chunk, origin)) for index, chunk in enumerate(chunks)}
     for index, chunk in enumerate(chunks):
         if chunk.sh.shape[1] > 1:
