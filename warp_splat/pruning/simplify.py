@@ -165,15 +165,14 @@ def _curve(opened: Opened, thinning: Thinning, output: Path) -> None:
         renders = [picture(view.camera, view.name) for view in views]
         seconds = time.perf_counter() - start
         pairs = zip(renders, views, strict=True)
-        rows.append(
-            {
-                "kept": share,
-                "Gaussians": len(splats.means),
-                "MB": written_bytes(output, opened.file._replace(splats=splats)) / 1e6,
-                "frames_per_second": len(views) / seconds,
-                f"{name}_PSNR": float(np.mean([psnr(render, view.picture, view.mask) for render, view in pairs])),
-            }
-        )
+        row = {
+            "kept": share,
+            "Gaussians": len(splats.means),
+            "MB": written_bytes(output, opened.file._replace(splats=splats)) / 1e6,
+            "frames_per_second": len(views) / seconds,
+            f"{name}_PSNR": float(np.mean([psnr(render, view.picture, view.mask) for render, view in pairs])),
+        }
+        rows.append(row)
     lines = [[f"{value:.2f}" if isinstance(value, float) else value for value in row.values()] for row in rows]
     print(format_table([head.replace("_", " ") for head in rows[0]], lines))
     write_csv(output.with_suffix(".curve.csv"), rows)
