@@ -1,7 +1,5 @@
 """From Gaussians on images to pixels: this package's lists and blend, view by view."""
 
-import itertools
-
 import numpy as np
 import torch
 from torch.autograd.function import once_differentiable
@@ -53,7 +51,7 @@ def draw(
     sizes = seen.drawn.sum(2).flatten().tolist() if request.packed else [count] * (scenes * cameras)
     into = [None] * len(sizes) if magnitudes is None else magnitudes.view(-1, 2).split(sizes)
     drawn = []
-    for (scene, camera), magnitudes_of_view in zip(itertools.product(range(scenes), range(cameras)), into, strict=True):
+    for (scene, camera), magnitudes_of_view in zip(np.ndindex(scenes, cameras), into, strict=True):
         mine = colors[scene, camera % colors.shape[1]]
         behind = None if request.backgrounds is None else request.backgrounds[scene, camera]
         view = Seen(*(part[scene, camera] for part in seen))

@@ -7,7 +7,6 @@ that are merged. Pixels are those of a call for each world, bit for bit. No grad
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
-from itertools import accumulate
 from numbers import Integral
 
 import torch
@@ -110,7 +109,7 @@ class Worlds:
         shown = {name: table.view(*shape, *table.shape[1:]) for name, table in found.items()}
         if self.options.strongest:  # numbered by world
             first = len(self.backdrop.splats.radii) if self.backdrop else 0
-            begins = send(torch.tensor([0, *accumulate(self.counts[:-1])]), image.device)
+            begins = send(torch.tensor([0, *self.counts[:-1]]).cumsum(0), image.device)
             shown["strongest"] -= torch.where(shown["strongest"] < first, 0, begins[:, None, None, None])
         if self.backdrop:
             own = self.bins.by_pixel(self.touched, self.camera.width).view_as(shown["alpha"])
