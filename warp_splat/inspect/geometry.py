@@ -39,9 +39,8 @@ def check_reprojection(subject: Subject) -> Iterator[Finding]:
         return
     names = {photo.name for photo in subject.photos}
     registered = [model.image(i) for i in sorted(model.reg_image_ids())]
-    chosen = sample([image for image in registered if image.name in names], VIEWS)
     widths = {}
-    for image in chosen:
+    for image in sample([image for image in registered if image.name in names], VIEWS):
         seen = [point for point in image.get_observation_points2D() if model.exists_point3D(point.point3D_id)]
         pairs = [(point.xy, xyz) for point in seen if np.isfinite(xyz := model.point3D(point.point3D_id).xyz).all()]
         if not pairs:
