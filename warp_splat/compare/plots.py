@@ -7,6 +7,7 @@ import numpy as np
 from matplotlib.ticker import LogLocator, NullLocator
 
 from warp_splat.compare.adjoints import Measurement
+from warp_splat.compare.workloads import CAPS
 from warp_splat.evaluation import report
 
 #: Color and marker of a variant.
@@ -18,9 +19,7 @@ STYLES = {
     "generated": ("#E69F00", "v"),
     "plain": (report.INK, "x"),
     "tape": (report.INK, "+"),
-    "cap 2048": ("#56B4E9", "1"),
-    "cap 512": ("#56B4E9", "2"),
-    "cap 128": ("#56B4E9", "3"),
+    **{f"cap {cap}": ("#56B4E9", str(number)) for number, cap in enumerate(CAPS, 1)},
     "central differences": ("#999999", "P"),
 }
 LEAST = 1e-8  # shown instead of an error of 0 on a logarithmic axis
