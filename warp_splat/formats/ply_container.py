@@ -58,7 +58,6 @@ def columns_of(rows: np.ndarray, names: Sequence[str], dtype: str = "f4") -> np.
 class Element(NamedTuple):
     """A table of the file, as the header announces it."""
 
-    name: str
     rows: int
     properties: dict[str, str]  # from names to NumPy types without byte order, or LIST
 
@@ -92,7 +91,7 @@ class PlyTables:
                 case ["element", name, count] if (
                     count.isdecimal() and len(count) <= COUNT_DIGITS and name not in self.elements
                 ):
-                    last = self.elements[name] = Element(name, int(count), {})
+                    last = self.elements[name] = Element(int(count), {})
                 case ["property", code, name] if last and code in TYPES and name not in last.properties:
                     last.properties[name] = TYPES[code]
                 case ["property", "list", _, _, name] if last and name not in last.properties:
