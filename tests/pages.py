@@ -8,11 +8,11 @@ from splat_files import some_splats
 
 from warp_splat.export_html import pack
 from warp_splat.formats.splats import SplatArrays
-from warp_splat.rendering.camera_paths import orbit_cameras
+from warp_splat.rendering.camera_paths import ORBIT_LENS, orbit_cameras
 
 EVIL = "</script><script>window.evil = 1</script><img src=x onerror='window.evil = 1'>\u2028.jpg"
 OPTIONS = {"ANTIALIASED": False, "ELLIPSOID": False, "LINEAR": False, "BACKGROUND": 0.0}
-CAMERAS = [("one", orbit_cameras(np.zeros(3), np.array([0, -1.0, 0]), np.array([0, 0, -9.0]), 1)[0])]
+CAMERAS = [("one", orbit_cameras(np.zeros(3), np.array([0, -1.0, 0]), np.array([0, 0, -9.0]), 1, ORBIT_LENS)[0])]
 
 
 class Blocks(HTMLParser):

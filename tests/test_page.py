@@ -16,7 +16,7 @@ from warp_splat.export_html.merge import groups, importance, merged
 from warp_splat.export_html.pack import parts, shown
 from warp_splat.formats.splats import SplatArrays
 from warp_splat.gaussians import GaussianModel
-from warp_splat.rendering.camera_paths import orbit_cameras
+from warp_splat.rendering.camera_paths import ORBIT_LENS, orbit_cameras
 
 PARTS = ["gaussians0", "gaussians1", "gaussians2", "gaussians3", "harmonics1", "harmonics2", "harmonics3"]
 
@@ -64,7 +64,7 @@ def test_what_cannot_be_seen_is_left_out_and_the_large_and_opaque_are_kept():
 
 
 def test_names_of_strangers_are_text():
-    cameras = [(EVIL, orbit_cameras(np.zeros(3), np.array([0, -1.0, 0]), np.array([0, 0, -9.0]), 1)[0])]
+    cameras = [(EVIL, orbit_cameras(np.zeros(3), np.array([0, -1.0, 0]), np.array([0, 0, -9.0]), 1, ORBIT_LENS)[0])]
     text = make_page(EVIL, some_splats(3), cameras, OPTIONS)
     page = Blocks(text)
     assert page.found["title"] == EVIL

@@ -28,13 +28,13 @@ from warp_splat.formats.png import load_png
 from warp_splat.formats.splats import SplatArrays, SplatFile
 from warp_splat.formats.stored import SH_C0
 from warp_splat.gaussians import GaussianModel
-from warp_splat.rendering.camera_paths import orbit_cameras
+from warp_splat.rendering.camera_paths import ORBIT_LENS, orbit_cameras
 from warp_splat.scene.types import Decoded, View
 
 
 def model(folder, splats, options=RasterOptions(), white=False, name="1.jpg", linear=False):  # noqa: B008 - frozen
     """A model folder with three cameras; (its path, a function from a camera to our picture, the cameras)."""
-    cameras = orbit_cameras(np.array([0.2, 0, 0]), np.array([0, -1.0, 0]), np.array([0, 2.0, -9.0]), 3)
+    cameras = orbit_cameras(np.array([0.2, 0, 0]), np.array([0, -1.0, 0]), np.array([0, 2.0, -9.0]), 3, ORBIT_LENS)
     cameras = [replace(camera.resized(280, 156), cx=150.0, cy=70.0) for camera in cameras]
     views = [View(name, camera, Decoded(np.zeros((1, 1, 3), np.uint8)), camera) for camera in cameras]
     save_gaussians(model_folder.ply_path(folder, 7), SplatFile(splats, options.antialiasing))
