@@ -69,12 +69,11 @@ class Worlds:
         if not isinstance(backdrop, Worlds | None):
             raise InputError(f"backdrop: expected what was drawn of another world, got {type(backdrop).__name__}.")
         self.way = camera, options
-        if backdrop and (
-            options.hidden_from is not None or len(backdrop.counts) > 1 or backdrop.backdrop or backdrop.way != self.way
-        ):
+        hides = options.hidden_from is not None
+        if backdrop and (hides or len(backdrop.counts) > 1 or backdrop.backdrop or backdrop.way != self.way):
             beside = "that has none itself, and nothing that hides"
             raise InputError(f"backdrop: expected one world of the same Camera object and options, {beside}.")
-        if options.hidden_from is not None:
+        if hides:
             shape = len(counts), camera.height, camera.width
             checks.check_tensor("hidden_from", options.hidden_from, shape, gaussians[0].device)
             options = replace(options, hidden_from=options.hidden_from.flatten(0, 1))
