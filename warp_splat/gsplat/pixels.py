@@ -84,9 +84,8 @@ def _draw_view(
     if into is not None:
         channels = [first, colors[:, 3:], *([seen.depths[:, None]] if options.depth else []), first.new_ones(count, 1)]
         channels = torch.cat(channels, 1)
-        image, others, depth, alpha = _Magnitudes.apply(
-            image, others, depth, alpha, channels, background, into, seen.drawn, blending
-        )
+        told = channels, background, into, seen.drawn, blending
+        image, others, depth, alpha = _Magnitudes.apply(image, others, depth, alpha, *told)
     parts = [image[..., : 3 - spare], others + (1 - alpha) * behind[3:]]
     if options.depth:
         parts.append(depth / alpha.clamp_min(LEAST) if wanted[-1] == "ED" else depth)
