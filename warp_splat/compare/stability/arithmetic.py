@@ -111,11 +111,8 @@ def too_many_tiles(_mode: str) -> Outcome:
 
 
 LOSSES = {"constant": (1.0, 0.0), "1e-8": (1e-8, 1.0), "1e4": (1e4, 1.0), "1e4_constant": (1e4, 0.0)}  # scale, noise
-GRADIENTS = {
-    1e-20: "as in float64",
-    1e20: "as in float64",
-    1e30: "the second moment overflows: the parameter stays where it is",
-}
+GRADIENTS = dict.fromkeys((1e-20, 1e20), "as in float64")
+GRADIENTS |= {1e30: "the second moment overflows: the parameter stays where it is"}
 TABLE = {
     "loss": {f"loss_{name}": ("value and gradient as in float64", partial(loss, *of)) for name, of in LOSSES.items()},
     "optimizer": {
