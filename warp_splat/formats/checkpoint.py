@@ -247,9 +247,8 @@ def load_own(path: str | Path, processes: Processes) -> Checkpoint:
                 found = {n: np.atleast_1d(array) for n, array in block.arrays.items() if OF_GAUSSIANS.fullmatch(n)}
                 if block.count("iteration") != whole.count("iteration") or (taken and found.keys() != taken[0].keys()):
                     raise Unexpected(f"one whose block {name} is that of another")
-                taken.append(
-                    {n: a[..., first:last] if n.startswith(OF_VIEWS) else a[first:last] for n, a in found.items()}
-                )
+                rows = slice(first, last)
+                taken.append({n: a[..., rows] if n.startswith(OF_VIEWS) else a[rows] for n, a in found.items()})
         if not taken:
             raise Unexpected(f"one of {end} Gaussians, fewer than there are processes")
         axes = {n: -1 if n.startswith(OF_VIEWS) else 0 for n in taken[0]}
