@@ -27,9 +27,8 @@ SEEN = {True: 0.6 / 255, False: 1e-9}  # of a cover, by whether pictures have 8 
 COMPANY = np.arange(16)
 NEARLY_ROUND = np.array([0.999, 1.001, 1.0])  # of scales: some viewers do not draw what is round to the last bit
 #: Values that renderers are known to have; a measured interval that holds one is named by it.
-KNOWN = {"1/255": 1 / 255, "1/512": 1 / 512} | {
-    f"{value:g}": value for value in (1e-3, 1e-4, 1e-5, 1e-6, 0.01, 0.1, 0.2, 0.3, 0.99, 0.999)
-}
+KNOWN = {"1/255": 1 / 255, "1/512": 1 / 512}
+KNOWN |= {f"{value:g}": value for value in (1e-3, 1e-4, 1e-5, 1e-6, 0.01, 0.1, 0.2, 0.3, 0.99, 0.999)}
 
 
 def probe_camera(focal: float = FOCAL, seed: int | None = None, **pose) -> Camera:
