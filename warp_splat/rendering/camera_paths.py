@@ -27,10 +27,10 @@ def look_at(lens: Camera, place: np.ndarray, target: np.ndarray, up: np.ndarray)
     right = np.cross(forward, up)
     right /= np.linalg.norm(right)
     rotation = np.stack([right, np.cross(forward, right), forward])
-    return moved(lens, rotation, place)
+    return placed_at(lens, rotation, place)
 
 
-def moved(lens: Camera, rotation: np.ndarray, place: np.ndarray) -> Camera:
+def placed_at(lens: Camera, rotation: np.ndarray, place: np.ndarray) -> Camera:
     """The camera ``lens`` at ``place`` [3], with the rows of ``rotation`` [3, 3] for its axes."""
     return replace(lens, rotation=rotation, translation=-rotation @ place, shutter=None)
 
@@ -126,7 +126,7 @@ def path_cameras(scene: Scene, count: int, lens: Camera) -> list[Camera]:
     places = CubicSpline(times, [cameras[key].center for key in kept])
     rotations = RotationSpline(times, Rotation.from_matrix([cameras[key].rotation for key in kept]))
     moments = np.linspace(0.0, times[-1], count)
-    return [moved(lens, *pose) for pose in zip(rotations(moments).as_matrix(), places(moments), strict=True)]
+    return [placed_at(lens, *pose) for pose in zip(rotations(moments).as_matrix(), places(moments), strict=True)]
 
 
 def _distances(cameras: list[Camera], extent: float) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import sys
 import time
@@ -124,6 +125,9 @@ def _tell(trainer: Trainer, run: Run, say: opening.Say) -> None:
         f"{len(scene.train)} training views, {len(scene.test)} test views, {width} x {height} px; "
         f"{len(scene.points)} points; {together}{pool.get_threads()} threads; output in {run.folder}"
     )
+    learn, shares = trainer.config.learn, trainer.photographs.shares
+    if shares and (full := math.ceil(learn.coarse_until_iter * shares[-1])) > learn.iterations:
+        say(f"Warning: images reach their full size in iteration {full}, after the end; lower --coarse_until_iter.")
     for sentence in trainer.told:
         say(sentence)
 

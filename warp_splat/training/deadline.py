@@ -75,15 +75,16 @@ def plan_training(scene: Scene, config: TrainConfig, processes: Processes, say: 
         InputError: if there is too little time for one change of the set of Gaussians, or the schedule does not fit.
     """
     minutes, learn = config.learn.minutes, config.learn
-    if (late := max(learn.coarse_until_iter * (learn.coarse > 1), learn.cooldown)) > learn.iterations:
-        raise InputError(
-            f"--minutes: expected coarse_until_iter, cooldown in {learn.iterations} iterations, got {late}; lower it."
-        )
     say("Measuring this machine (kernels are compiled first, once on a machine, about 20 s) ...")
     measured_as = suggested(config, scene).changed(settle_from_iter=1, minutes=0.0)  # its set stays as it is
     trial = Trainer(scene, measured_as, processes)
     trial.warm_up()
     task = task_of(config, scene, trial.photographs.shares)
+    if (late := max(learn.coarse_until_iter * max(task.shares, default=0), learn.cooldown)) > learn.iterations:
+        raise InputError(
+            f"--minutes: expected full size and cooldown in {learn.iterations} iterations, got {late:.0f}; lower "
+            "coarse_until_iter, or cooldown."
+        )
     cost = cost_of(trial, task, say)
     plan = plan_for(config, cost, 60.0 * minutes, task)
     say(f"Plan for {minutes:g} minutes ({seconds_of(plan, cost, task):.0f} s by these figures): {as_flags(plan)}")

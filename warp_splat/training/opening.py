@@ -124,10 +124,8 @@ def refuse_other_training(folder: Path, begun: Checkpoint | None) -> None:
 
 def open_scene(config: TrainConfig, begun: Checkpoint | None, say: Say, processes: int = 1) -> Scene:
     """Read the scene and tell what may surprise."""
-    data, learn = config.data, config.learn
+    data = config.data
     say(f"Scene {data.source_path}")
-    if learn.coarse > 1 and learn.coarse_until_iter > learn.iterations:
-        say(f"Warning: images reach their full size at --coarse_until_iter {learn.coarse_until_iter}, after the end.")
     start = data.start_ply if not begun or os.path.exists(data.start_ply) else ""  # if it has gone
     same = {name: getattr(data, name) for name in OF_SCENE}
     memory = photo_memory(config.machine.photo_memory, processes)
