@@ -7,6 +7,7 @@ import numpy as np
 import pycolmap
 import pytest
 from commands import SHORT
+from hostile import refusal
 from PIL import Image
 from scipy.spatial.transform import Rotation
 from splat_files import some_file
@@ -28,7 +29,7 @@ from warp_splat.inspect.verdicts import check_coordinates
 from warp_splat.rendering.camera_paths import focus_point
 from warp_splat.scene import load_scene
 from warp_splat.scene.embedded import embedded_scene
-from warp_splat.sfm.georeference import _gps, georeference
+from warp_splat.sfm.georeference import _gps, georeference, require_named
 
 UTM = np.array([691_000.25, 5_335_000.5, 520.0])
 COUNT = 16
@@ -189,6 +190,21 @@ def test_files_of_gaussians_keep_the_origin(tmp_path, ending):
     assert load_gaussians(tmp_path / f"a{ending}").coordinates == where
     save_gaussians(tmp_path / f"b{ending}", splats)
     assert load_gaussians(tmp_path / f"b{ending}").coordinates is None
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        ("name,x,y,z\na,1,2,3\nb.jpg,1,2,4\nc,2,2,3", "lines that name photographs, 3 at least, found 1"),
+        ("name,other,distance\na,b.jpg,3", "lines that name photographs, 1 at least, found 0"),
+        ("name,x,y,z\na.jpg,1,2,3\nb.jpg,1,2,4\nc.jpg,2,2,3\nd,1,1,1", ""),
+        ("name,other,distance\na.jpg,b.jpg,3", ""),
+    ],
+)
+def test_names_of_no_photograph_are_told_before_cameras_are_computed(text, found, tmp_path):
+    (tmp_path / "a.csv").write_text(text)
+    ask = lambda: require_named(tmp_path / "a.csv", ["a.jpg", "b.jpg", "c.jpg"])  # noqa: E731
+    refusal(ask, found) if found else ask()
 
 
 def test_a_scene_with_coordinates_is_upright_and_says_where(tmp_path):

@@ -28,7 +28,7 @@ from warp_splat.scene import has_cameras, images
 from warp_splat.scene.colmap_library import pycolmap, require_pycolmap
 from warp_splat.scene.photos import OTHER_PHOTOS, PHOTOS, VIDEOS, find_files, is_video, photo_root, scene_of, sfm_hint
 from warp_splat.sfm import mapping, stages
-from warp_splat.sfm.georeference import georeference, read_places, scale_as_usual
+from warp_splat.sfm.georeference import georeference, read_places, require_named, scale_as_usual
 from warp_splat.sfm.matching import match
 from warp_splat.text import few
 
@@ -180,6 +180,8 @@ def _reconstruct(root: Path, names: list[str], scene: Path, work: Path, config: 
     groups, broken = _groups(root, names, config.threads, say)
     if len(names := [name for group in groups for name in group]) < LEAST:
         raise InputError(f"{root}: expected at least {LEAST} readable photographs, found {len(names)}; add some.")
+    if config.coordinates not in ("auto", "none"):
+        require_named(Path(config.coordinates), names)
     lenses = f"{len(groups)} lens{'es' * (len(groups) > 1)}"
     say(f"{len(names)} photographs, {lenses}, {config.threads} threads; work in {work}")
     database = work / "database.db"

@@ -173,6 +173,17 @@ def _gps(database: Path) -> tuple[dict[str, np.ndarray], str]:
     return dict(zip(found, places, strict=True)), f"UTM zone {zone} {'south' if south else 'north'}, WGS 84, from GPS"
 
 
+def require_named(path: Path, photographs: list[str]) -> None:
+    """Raise InputError if a CSV file names too few of the photographs, hours before it is needed."""
+    first, rows = read_places(path)
+    found, least = sum({*names} <= {*photographs} for names, _ in rows), LEAST if first == POSITIONS else 1
+    if found < least:
+        raise InputError(
+            f"{path}: expected lines that name photographs, {least} at least, found {found}; names are such as "
+            f"{photographs[0]}."
+        )
+
+
 def read_places(path: Path) -> tuple[list[str], list[tuple[list[str], list[float]]]]:
     """The first line of a CSV file, and of the others the names and the numbers."""
     with reading(path, f"a CSV file that begins with {','.join(POSITIONS)} or {','.join(DISTANCES)}"):
