@@ -185,7 +185,8 @@ sys.exit(main(["train", *sys.argv[1:], *(OPTIONS if os.environ["RANK"] == "1" el
     [
         pytest.param(["--seed", "3"], "the same seed as of process 0, 0, got 3", marks=pytest.mark.slow),
         pytest.param(["--no-shard"], "the same shard as of process 0, True, got False", marks=pytest.mark.long),
-        pytest.param(["--eval"], "the same photographs as of process 0", marks=pytest.mark.long),
+        pytest.param(["-r", "4"], "the same resolution as of process 0, 8, got 4", marks=pytest.mark.long),
+        pytest.param(["--save_iterations", "5"], "the same save_iterations as", marks=pytest.mark.long),
     ],
 )
 def test_other_options_of_a_process_are_told_before_the_first_step(options, found, tmp_path):

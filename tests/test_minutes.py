@@ -87,7 +87,7 @@ def test_plans_take_their_time_and_keep_the_shape(minutes):
     assert TASK.least <= plan.grow.max_gaussians <= TASK.most
     factor = plan.learn.iterations / FAST.learn.iterations
     before, after = schedule_of(FAST), schedule_of(plan)
-    brief = {"cooldown", "coarse_until_iter"} if factor < 0.3 else set()  # see below
+    brief = {"cooldown", "coarse_until_iter"} if factor < 0.3 else set()
     for name in before.keys() - brief:
         assert after[name] == pytest.approx(factor * before[name], rel=2e-3, abs=1.0), name
     others = {name for name, value in plan.flat().items() if value != FAST.flat()[name]} - {"densification_interval"}
@@ -147,11 +147,11 @@ def test_the_package_compares_with_what_was_measured():
         assert entry.psnr == float(row["PSNR dB"])
 
 
-def taken(learn: LearnOptions, pace, spent: float = 0.0) -> tuple[float, int, int]:
-    """Seconds at the end, the step before the cooldown and its length, where step k takes pace(k) seconds."""
-    deadline, iteration, end, settled = Deadline(learn, TASK.shares), 0, np.inf, (0, 0)
+def taken(learn: LearnOptions, pace, spent: float = 0.0, count: int = 1) -> tuple[float, int, int]:
+    """Seconds at the end, the iteration before the cooldown and its length, where a step to k takes pace(k) seconds."""
+    deadline, iteration, end, settled = Deadline(learn, TASK.shares, count), 0, np.inf, (0, 0)
     while iteration < end:
-        iteration += 1
+        iteration += count
         spent += pace(iteration)
         if end == np.inf and (cooldown := deadline.due(iteration, spent)):
             settled = (iteration, cooldown)
@@ -185,6 +185,26 @@ def test_trainings_end_in_time(name):
     assert begun >= LEARN.coarse_until_iter * TASK.shares[-1] and LEARN.cooldown // 4 <= cooldown <= LEARN.cooldown
     if name in ("as planned", "twice as fast", "noisy"):
         assert cooldown > 0.95 * LEARN.cooldown
+
+
+@pytest.mark.parametrize("count", [1, 4, 8])
+@pytest.mark.parametrize("factor", [0.08, 0.16, 0.25])
+@pytest.mark.parametrize("name", ["as planned", "noisy", "half as fast from the middle", "slower by a tenth"])
+def test_brief_trainings_end_in_time(name, factor, count):
+    """The full size comes so late that little is left to look at the pace, less with several images a step."""
+    learn = of_length(FAST, factor, TASK).changed(minutes=1.0).learn
+    costs = np.array([0.1 + shrink_at(learn, TASK.shares, step) ** -2.0 for step in range(learn.iterations)])
+    step = lambda k: 60.0 / costs.sum() * costs[min(k, learn.iterations - 1)] * count  # noqa: E731
+    paces = {
+        "as planned": step,
+        "noisy": lambda k: step(k) * (1 + ((k * 7919 % 101) / 100 - 0.5) * count**-0.5),  # a mean over images
+        "half as fast from the middle": lambda k: step(k) * (1 + (k > learn.iterations / 2)),
+        "slower by a tenth": lambda k: 1.1 * step(k),
+    }
+    seconds, begun, cooldown = taken(learn, paces[name], count=count)
+    assert abs(seconds - 60) < 0.1 * 60
+    assert begun >= learn.coarse_until_iter * TASK.shares[-1]
+    assert cooldown > 0.7 * learn.cooldown or name.startswith(("half", "slower"))
 
 
 def test_the_full_size_and_a_cooldown_come_even_where_time_is_up():
@@ -265,17 +285,14 @@ def test_a_shape_has_to_fit_its_iterations(scene):
         refusal(lambda: plan_training(scene, config, ALONE, str), "cooldown in 50 iterations, got 51")  # noqa: B023
 
 
-@pytest.mark.parametrize(("factor", "end"), [(1.0, 1), (0.3, 1), (0.2, 2 / 3), (0.05, 1 / 3)])
-def test_far_below_the_shape_its_end_is_brief(factor, end):
-    """The full size comes later, the cooldown as well, and always within the full size."""
-    plans = [
-        of_length(FAST, factor, TASK).learn,
-        of_length(FAST.changed(coarse=1), factor, TASK._replace(shares=())).learn,
-    ]
-    shares = [1 - plan.coarse_until_iter * TASK.shares[-1] / plan.iterations for plan in plans]
-    assert shares[0] == pytest.approx(end * (1 - 2800 * 0.7 / 3600), abs=0.01)
-    assert plans[0].cooldown == pytest.approx(end * plans[1].cooldown, abs=1)
-    assert plans[0].cooldown < shares[0] * plans[0].iterations
+@pytest.mark.parametrize(("factor", "late"), [(1.0, 0), (0.3, 0), (0.225, 0.5), (0.15, 1), (0.05, 1)])
+def test_far_below_the_shape_the_full_size_comes_late(factor, late):
+    """The more so the shorter, up to where sizes take all steps; the cooldown stays within it."""
+    plan, plain = of_length(FAST, factor, TASK).learn, of_length(FAST, factor, TASK._replace(shares=())).learn
+    coarse = plan.coarse_until_iter / plan.iterations
+    assert coarse == pytest.approx(2800 / 3600 + late * 800 / 3600, abs=0.01)
+    assert plan.cooldown == pytest.approx(plain.cooldown * (1 - 0.7 * coarse) / (1 - 0.7 * 2800 / 3600), abs=1.5)
+    assert plan.cooldown < (1 - 0.7 * coarse) * plan.iterations
 
 
 def test_a_densification_has_to_fit(scene):

@@ -97,7 +97,7 @@ def drawn_views(opened: Opened, memory: float) -> list[Drawn]:
     share = min(1.0, math.sqrt(memory / PIXEL / sum(camera.width * camera.height for camera in cameras)))
     if (edge := share * min(min(camera.width, camera.height) for camera in cameras)) < LEAST:
         larger = "train on larger photographs, or raise --memory"
-        raise InputError(f"{opened.path}: expected views of {LEAST} px and more, found {edge:.0f}; {larger}.")
+        raise InputError(f"{opened.path}: expected views of {LEAST} px and more, found {int(edge)}; {larger}.")
     with torch.no_grad():
         gaussians = GaussianModel.from_splats(opened.file.splats).to(background.device).activated()
         for view, camera in zip(opened.scene.train, cameras, strict=True):

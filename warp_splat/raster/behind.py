@@ -14,7 +14,7 @@ from warp_splat.lenses import Lens
 from warp_splat.lenses.shutter import rotated
 from warp_splat.raster.camera_parameters import CameraParameters
 from warp_splat.raster.drivers import driver_of
-from warp_splat.runtime.launch import launch_in_lanes, load, view
+from warp_splat.runtime.launch import launch_in_lanes, load, send, view
 from warp_splat.runtime.sums import in_pairs
 from warp_splat.runtime.timers import stage
 
@@ -34,8 +34,8 @@ def put_behind(
             of its base.
     """
     base, pose = (camera.base, camera.camera) if isinstance(camera, CameraParameters) else (camera, camera)
-    intrinsics = base.width, base.height, base.fx, base.fy, base.cx, base.cy
-    rays, blind = _rays(*intrinsics, base.lens, pose.shutter.turn if pose.shutter else (), image.device)
+    rays, blind = _rays(base.width, base.height, base.fx, base.fy, base.cx, base.cy, base.lens, image.device)
+    rays = _turned(rays, pose) if pose.shutter else rays
     if blind is not None:
         alpha = alpha.masked_fill(blind, 1.0)
     with stage("environment"):
@@ -50,22 +50,26 @@ def load_kernels(device: torch.device) -> None:
 
 @functools.lru_cache(maxsize=KEPT)
 def _rays(
-    width: int, height: int, fx: float, fy: float, cx: float, cy: float, lens: Lens | None, turn, device: torch.device
+    width: int, height: int, fx: float, fy: float, cx: float, cy: float, lens: Lens | None, device: torch.device
 ) -> tuple[torch.Tensor, torch.Tensor | None]:
-    """What the pixels of a camera see, [H * W, 3] float32 in its axes; and which see nothing, [H, W], if any.
-
-    With the ``turn`` of a rolling shutter, in the axes of its middle.
-    """
+    """What the pixels of a camera see, [H * W, 3] float32 in its axes; and which see nothing, [H, W], if any."""
     x, y = (np.arange(width) + 0.5 - cx) / fx, (np.arange(height) + 0.5 - cy) / fy
     places = np.stack(np.broadcast_arrays(x, y[:, None]), -1).reshape(-1, 2)
     rays = lens.undistorted(places) if lens else np.concatenate([places, np.ones((len(places), 1))], 1)
     blind = ~np.isfinite(rays).all(1)
     rays[blind] = (0.0, 0.0, 1.0)
-    for row in range(height) if turn else ():
-        back = (0.5 - (row + 0.5) / height) * np.array(turn)[:, None]
-        rays[row * width : (row + 1) * width] = rotated(rays[row * width : (row + 1) * width].T, back, 1).T
     found = torch.from_numpy(rays.astype(np.float32)).to(device)
     return found, torch.from_numpy(blind.reshape(height, width)).to(device) if blind.any() else None
+
+
+def _turned(rays: torch.Tensor, camera: Camera) -> torch.Tensor:
+    """Rays of a rolling shutter's rows, from the axes of each into those of the middle."""
+    assert camera.shutter
+    shares, axis = 0.5 - (np.arange(camera.height) + 0.5) / camera.height, np.array(camera.shutter.turn)[:, None]
+    turns = np.stack([rotated(np.eye(3), share * axis, 1) for share in shares]).astype(np.float32)
+    x, y, z = send(torch.from_numpy(turns), rays.device).mT[:, None].unbind(2)  # what each axis becomes, [H, 1, 3]
+    right, down, forward = rays.view(camera.height, -1, 3).split(1, 2)
+    return (right * x + down * y + forward * z).view(-1, 3)
 
 
 class _PutBehind(torch.autograd.Function):

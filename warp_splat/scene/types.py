@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from warp_splat.scene.blocks import Block
 
 WALK = 5.0  # times as far away as what comes near: the largest extent
-REFINED = 0.05  # of a scene's extent, and rad, by which a training moves or turns no camera
+REFINED = 0.05  # of a scene's extent, and rad, together, by which a training moves and turns no camera
 EVALUATED = 100  # views, at most, of those for training: hundreds more would take hours, and say the same
 
 

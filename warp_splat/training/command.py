@@ -38,6 +38,10 @@ from warp_splat.training.trial import settle_parts
 if TYPE_CHECKING:
     from warp_splat.training.live import TrainingViewer
 
+#: Options that may differ between processes that train together.
+OWN = {"source_path", "start_ply", "start_checkpoint", "config", "model_path", "lpips_weights", "verify"}
+OWN |= {"device", "data_device", "photo_memory", "threads", "quiet", "port", "tensorboard"}
+
 
 def train(config: TrainConfig) -> int:
     """Train as ``config`` says; returns the process's exit code.
@@ -98,8 +102,7 @@ def _train(config: TrainConfig, processes: Processes) -> int:
     say = opening.speaker(config.report.quiet)
     run = Run(Path(config.report.model_path), time.perf_counter())
     scene = opening.open_scene(config, begun, say, processes.local_count)
-    own = {*vars(config.data), *vars(config.report), *vars(config.machine)} - {"shard"}  # what may differ
-    facts = {name: value for name, value in config.flat().items() if name not in own}
+    facts = {name: value for name, value in config.flat().items() if name not in OWN}
     processes.check_alike(facts | {"photographs": [view.name for view in scene.train]})
     if config.learn.minutes and not begun:
         config = plan_training(scene, config, processes, say)

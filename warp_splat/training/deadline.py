@@ -21,7 +21,8 @@ from warp_splat.training.trial import suggested
 REACHED = Path(__file__).with_name("reached.json")  # what benchmarks/minutes.py measured
 REPEATS = 5  # steps of which one is timed: their median
 WINDOW = 20  # parts of a training: as far back as the pace is looked at, which is from one evaluation to the next
-FEWEST = 10  # steps by which a pace is known
+FULL_WINDOW = 8  # likewise, of the steps at full size
+FEWEST = 10  # images by which a pace is known
 WIDER = 1.35  # than copies that cover what the start does: so they take 0.8 to 1.05 of trained ones' time (4 scenes)
 KEPT = 4  # a cooldown is never shorter than one part in so many of the planned one
 
@@ -41,7 +42,9 @@ class Deadline:
     def __init__(self, learn: LearnOptions, shares: Sequence[float] = (), count: int = 1):
         self.seconds, self.cooldown = 60.0 * learn.minutes, learn.cooldown
         self.full_size = learn.coarse_until_iter * shares[-1] if shares else 0.0  # the step from which they have it
-        self.past: deque[tuple[int, float]] = deque(maxlen=max(learn.iterations // (WINDOW * count), FEWEST))
+        self.fewest = max(-(-FEWEST // count), 2)
+        window = min(learn.iterations / WINDOW, (learn.iterations - self.full_size) / FULL_WINDOW)
+        self.past: deque[tuple[int, float]] = deque(maxlen=max(int(window / count), self.fewest))
         self.near = math.inf  # the step since which the end is near by each pace that was seen
 
     def due(self, iteration: int, spent: float, processes: Processes = ALONE) -> int:
@@ -62,7 +65,7 @@ class Deadline:
             elif len(self.past) == self.past.maxlen:
                 self.near = min(self.near, iteration)
             # in time, by a pace that has been the same for a while; late, by the few steps there are
-            late = left <= self.cooldown / 2 and len(self.past) >= FEWEST
+            late = left <= self.cooldown / 2 and len(self.past) >= self.fewest
             if late or (left <= self.cooldown and first >= self.near):
                 steps = max(round(left), self.cooldown // KEPT, 1)
         return processes.largest(steps if processes.rank == 0 else 0)

@@ -3,7 +3,7 @@
 The options of a training are the shape of a schedule: a plan stretches or shrinks all its steps by one factor, until
 what they cost adds up to the time. Below the shape's own length there are also fewer Gaussians, by the square root of
 that factor, and rates are higher by it, up to :data:`QUICKEST` times. The set grows at least as often as it has to
-double. Far below, photographs have their full size later, and the cooldown is shorter (:data:`BRIEF`). A clock decides
+double. Below twice :data:`BRIEF`, photographs have their full size later, and the cooldown is shorter. A clock decides
 on the end itself (:mod:`warp_splat.training.deadline`), so that a plan has to be good, but not exact.
 """
 
@@ -25,7 +25,7 @@ SHORTEST, LONGEST = 1e-4, 1e4  # times the shape
 SAMPLES = 1000  # steps whose costs are added up
 RATES = ("position_lr_init", "position_lr_final", "feature_lr", "opacity_lr", "scaling_lr", "rotation_lr")
 QUICKEST = 2.0  # times the rates of the shape; four times lost 1 to 8 dB (benchmarks/short_plans.py)
-BRIEF, LEAST = 0.3, 1 / 3  # times the shape: below, its end shrinks in proportion, at most to so much (recipes.md)
+BRIEF = 0.15  # times the shape, down to which the full size comes later and later (docs/recipes.md)
 EARLY = 4  # densifications of a plan with too many points, at least: the first one takes the rest away
 LIKE = 1.5  # factor between the steps and between the pixels of two trainings, up to which they are comparable
 
@@ -96,11 +96,10 @@ def of_length(config: TrainConfig, factor: float, task: Task) -> TrainConfig:
     least = {item.name: max(item.metadata["least"], 1) for item in flags_of(TrainConfig) if item.metadata["schedule"]}
     steps = schedule_of(config)
     steps["cooldown"] = steps["cooldown"] or round(COOLDOWN * steps["iterations"])
-    if config.learn.coarse > 1 and task.shares:
-        end = min(max(factor / BRIEF, LEAST), 1.0)
-        full = steps["iterations"] - steps["coarse_until_iter"] * task.shares[-1]
-        steps["coarse_until_iter"] += max(full, 0) * (1 - end) / task.shares[-1]
-        steps["cooldown"] *= end
+    if task.shares and (full := steps["iterations"] - task.shares[-1] * steps["coarse_until_iter"]) > 0:
+        late = min(max(2 - factor / BRIEF, 0.0), 1.0)
+        steps["coarse_until_iter"] += late * max(steps["iterations"] - steps["coarse_until_iter"], 0)
+        steps["cooldown"] *= (steps["iterations"] - task.shares[-1] * steps["coarse_until_iter"]) / full
     steps = {name: max(round(factor * value), least[name]) if value > 0 else value for name, value in steps.items()}
     shorter = min(factor, 1.0) ** 0.5
     most = max(round(task.most * shorter), task.least)
