@@ -286,13 +286,14 @@ def test_a_shape_has_to_fit_its_iterations(scene):
 
 
 @pytest.mark.parametrize(("factor", "late"), [(1.0, 0), (0.3, 0), (0.225, 0.5), (0.15, 1), (0.05, 1)])
-def test_far_below_the_shape_the_full_size_comes_late(factor, late):
-    """The more so the shorter, up to where sizes take all steps; the cooldown stays within it."""
-    plan, plain = of_length(FAST, factor, TASK).learn, of_length(FAST, factor, TASK._replace(shares=())).learn
-    coarse = plan.coarse_until_iter / plan.iterations
-    assert coarse == pytest.approx(2800 / 3600 + late * 800 / 3600, abs=0.01)
-    assert plan.cooldown == pytest.approx(plain.cooldown * (1 - 0.7 * coarse) / (1 - 0.7 * 2800 / 3600), abs=1.5)
-    assert plan.cooldown < (1 - 0.7 * coarse) * plan.iterations
+@pytest.mark.parametrize(("share", "brief"), [(0.7, 0.3), (0.6, 0.4), (1.0, 1 / 9), (0.0, 1.0)])
+def test_far_below_the_shape_the_full_size_comes_late(factor, late, share, brief):
+    """The more so the shorter, up to where sizes take all steps, or half of its own; the cooldown likewise."""
+    plan, plain = (of_length(FAST, factor, TASK._replace(shares=shares)).learn for shares in ((0.4 * share, share), ()))
+    own = 1 - share * 2800 / 3600
+    full = 1 - share * plan.coarse_until_iter / plan.iterations
+    assert full == pytest.approx(own + late * (brief - own), abs=0.01)
+    assert plan.cooldown == pytest.approx(plain.cooldown * full / own, abs=2)
 
 
 def test_a_densification_has_to_fit(scene):

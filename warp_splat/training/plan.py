@@ -96,10 +96,12 @@ def of_length(config: TrainConfig, factor: float, task: Task) -> TrainConfig:
     least = {item.name: max(item.metadata["least"], 1) for item in flags_of(TrainConfig) if item.metadata["schedule"]}
     steps = schedule_of(config)
     steps["cooldown"] = steps["cooldown"] or round(COOLDOWN * steps["iterations"])
-    if task.shares and (full := steps["iterations"] - task.shares[-1] * steps["coarse_until_iter"]) > 0:
-        late = min(max(2 - factor / BRIEF, 0.0), 1.0)
-        steps["coarse_until_iter"] += late * max(steps["iterations"] - steps["coarse_until_iter"], 0)
-        steps["cooldown"] *= (steps["iterations"] - task.shares[-1] * steps["coarse_until_iter"]) / full
+    share, late = max(task.shares, default=0.0), min(max(2 - factor / BRIEF, 0.0), 1.0)
+    if share * late and (full := steps["iterations"] - share * steps["coarse_until_iter"]) > 0:
+        brief = min(max((1 - share) * steps["iterations"], 0.5 * full), full)  # no later than sizes take all steps
+        brief = full - late * (full - brief)
+        steps["coarse_until_iter"] = (steps["iterations"] - brief) / share
+        steps["cooldown"] *= brief / full
     steps = {name: max(round(factor * value), least[name]) if value > 0 else value for name, value in steps.items()}
     shorter = min(factor, 1.0) ** 0.5
     most = max(round(task.most * shorter), task.least)
