@@ -23,7 +23,7 @@ from warp_splat.formats.coordinates import (
     write_coordinates,
 )
 from warp_splat.formats.exchange import load_gaussians, save_gaussians
-from warp_splat.formats.model_folder import write_cameras
+from warp_splat.formats.model_folder import ply_path, write_cameras
 from warp_splat.inspect.subject import Subject
 from warp_splat.inspect.verdicts import check_coordinates
 from warp_splat.rendering.camera_paths import focus_point
@@ -195,8 +195,8 @@ def test_files_of_gaussians_keep_the_origin(tmp_path, ending):
 @pytest.mark.parametrize(
     ("text", "found"),
     [
-        ("name,x,y,z\na,1,2,3\nb.jpg,1,2,4\nc,2,2,3", "lines that name photographs, 3 at least, found 1"),
-        ("name,other,distance\na,b.jpg,3", "lines that name photographs, 1 at least, found 0"),
+        ("name,x,y,z\na,1,2,3\nb.jpg,1,2,4\nc,2,2,3", "lines of photographs such as a.jpg, 3 at least, found 1"),
+        ("name,other,distance\na,b.jpg,3", "lines of photographs such as a.jpg, 1 at least, found 0"),
         ("name,x,y,z\na.jpg,1,2,3\nb.jpg,1,2,4\nc.jpg,2,2,3\nd,1,1,1", ""),
         ("name,other,distance\na.jpg,b.jpg,3", ""),
     ],
@@ -272,6 +272,10 @@ def test_a_model_of_other_cameras_is_refused(tmp_path, fails):
     resumed = ["train", "--resume", model, "--iterations", "2"]
     for command in (["render", "-m", model, "--quiet"], new, resumed):
         assert "name the scene that it was trained on" in fails(*command)
+    beside = ply_path(model, 1).parent / "cameras.json"
+    beside.write_text(cameras.read_text())  # refined with the Gaussians, as far as was asked for
+    assert main([str(word) for word in (*resumed, "-m", tmp_path / "refined")]) == 0
+    beside.unlink()
     axes = np.array([entry["rotation"] for entry in entries])  # columns, in the world
     for angle, share, refused in ((0.01, 1, False), (0.1, 1, True), (0.1, 0.4, True), (0.1, 0.1, False)):
         moved = [

@@ -11,7 +11,7 @@ from warp_splat.camera import Camera
 from warp_splat.kernels.environment import RUN, make_adj_put_behind, make_put_behind
 from warp_splat.kernels.simd import vec48
 from warp_splat.lenses import Lens
-from warp_splat.lenses.shutter import rotated
+from warp_splat.lenses.shutter import Shutter, rotated
 from warp_splat.raster.camera_parameters import CameraParameters
 from warp_splat.raster.drivers import driver_of
 from warp_splat.runtime.launch import launch_in_lanes, load, send, view
@@ -35,7 +35,7 @@ def put_behind(
     """
     base, pose = (camera.base, camera.camera) if isinstance(camera, CameraParameters) else (camera, camera)
     rays, blind = _rays(base.width, base.height, base.fx, base.fy, base.cx, base.cy, base.lens, image.device)
-    rays = _turned(rays, pose) if pose.shutter else rays
+    rays = _turned(rays, pose.shutter, base.height) if pose.shutter else rays
     if blind is not None:
         alpha = alpha.masked_fill(blind, 1.0)
     with stage("environment"):
@@ -62,13 +62,12 @@ def _rays(
     return found, torch.from_numpy(blind.reshape(height, width)).to(device) if blind.any() else None
 
 
-def _turned(rays: torch.Tensor, camera: Camera) -> torch.Tensor:
+def _turned(rays: torch.Tensor, shutter: Shutter, height: int) -> torch.Tensor:
     """Rays of a rolling shutter's rows, from the axes of each into those of the middle."""
-    assert camera.shutter
-    shares, axis = 0.5 - (np.arange(camera.height) + 0.5) / camera.height, np.array(camera.shutter.turn)[:, None]
+    shares, axis = 0.5 - (np.arange(height) + 0.5) / height, np.array(shutter.turn)[:, None]
     turns = np.stack([rotated(np.eye(3), share * axis, 1) for share in shares]).astype(np.float32)
     x, y, z = send(torch.from_numpy(turns), rays.device).mT[:, None].unbind(2)  # what each axis becomes, [H, 1, 3]
-    right, down, forward = rays.view(camera.height, -1, 3).split(1, 2)
+    right, down, forward = rays.view(height, -1, 3).split(1, 2)
     return (right * x + down * y + forward * z).view(-1, 3)
 
 

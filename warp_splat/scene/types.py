@@ -15,7 +15,7 @@ from warp_splat.color import to_srgb
 from warp_splat.config import NEAR
 from warp_splat.errors import InputError
 from warp_splat.formats.coordinates import UP, read_coordinates
-from warp_splat.formats.model_folder import folder_of, read_cameras
+from warp_splat.formats.model_folder import CAMERAS, folder_of, read_cameras
 from warp_splat.formats.splats import SplatFile
 
 if TYPE_CHECKING:
@@ -178,10 +178,11 @@ class Scene:
             )
         ends = lambda camera: camera.center + self.extent * camera.rotation  # noqa: E731 - of its axes, [3, 3]
         here, off = {view.name: ends(view.camera) for view in (*self.train, *self.test)}, []
+        refined = [*folder_of(name).glob(f"point_cloud/*/{CAMERAS}")]  # as far as was asked for
         with suppress(InputError):  # another trainer's file may tell other things
             cameras = [(ends(camera), here[view]) for view, camera in read_cameras(folder_of(name)) if view in here]
             off = [np.linalg.norm(there - at, axis=1).max() for there, at in cameras]
-        if off and (far := np.quantile(off, 0.75) / self.extent) > REFINED:
+        if off and not refined and (far := np.quantile(off, 0.75) / self.extent) > REFINED:
             raise InputError(
                 f"{name}: expected cameras as in {self.source}, found a quarter of them moved or turned by {far:.0%} "
                 "of its size; name the scene that it was trained on, or a copy of its .ply (-m, --start_ply)."

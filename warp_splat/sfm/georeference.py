@@ -179,8 +179,7 @@ def require_named(path: Path, photographs: list[str]) -> None:
     found, least = sum({*names} <= {*photographs} for names, _ in rows), LEAST if first == POSITIONS else 1
     if found < least:
         raise InputError(
-            f"{path}: expected lines that name photographs, {least} at least, found {found}; names are such as "
-            f"{photographs[0]}."
+            f"{path}: expected lines of photographs such as {photographs[0]}, {least} at least, found {found}."
         )
 
 
