@@ -66,7 +66,8 @@ def mesh(config: MeshConfig) -> int:
     voxel, voxels = _grid(config, natural, views, memory / 2)
     surface = surface_in(voxels, views, voxel, config.watertight)
     if not (found := len(surface.faces)):
-        raise InputError(f"no surface crosses voxels of {voxel:.3g}; try --voxel {min(natural, voxel / 2):.2g}.")
+        smaller = min(natural, voxel / 2)
+        raise InputError(f"{config.model}: no surface crosses voxels of {voxel:.3g}; try --voxel {smaller:.2g}.")
     if 0 < config.triangles < found:
         surface = simplified(surface, config.triangles)
     if config.crop:  # smoothing and simplifying move vertices
