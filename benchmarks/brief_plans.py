@@ -8,11 +8,10 @@ kept in a folder and not repeated.
 
 import json
 import time
-from pathlib import Path
 from unittest import mock
 
 import numpy as np
-from common import option, parse, write_table
+from common import PHOTOGRAPHS, parse, write_table
 from made_up import take_steps
 
 from warp_splat.evaluation.metrics import ssim
@@ -55,17 +54,14 @@ def train(scene: Scene, name: str, share: float, brief: float, seed: int) -> dic
 
 
 def main() -> None:
-    arguments = parse(
-        __doc__,
-        option("--runs", type=Path, required=True, help="folder for what has been run"),
-        option("--fox", type=Path, required=True),
-        option("--church", type=Path, required=True),
-    )
+    arguments = parse(__doc__, *PHOTOGRAPHS)
     launch.prepare("cpu", 1)
     arguments.runs.mkdir(parents=True, exist_ok=True)
     places = {"fox": arguments.fox, "church": arguments.church, "embedded": embedded_scene()}
     rows = []
     for (name, divisor), pairs in SHARES.items():
+        if not places[name]:
+            continue
         scene = load_scene(places[name], eval=True, resolution=divisor if divisor > 1 else -1)
         for shares in pairs:
             found: tuple[list, list] = [], []

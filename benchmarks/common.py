@@ -34,12 +34,12 @@ REPEATS = option("--repeats", type=int, default=7)
 MODELS = option("--models", type=Path, required=True, help="folder for the models")
 TRAINED = option("-m", "--models", type=Path, action="append", required=True, help="a trained model; may come again")
 SCENE = option("-s", "--scene", type=Path, help="a scene of photographs, besides the embedded one")
-RUNS = (
+PHOTOGRAPHS = (
     option("--runs", type=Path, required=True, help="folder for what has been run"),
     option("--fox", type=Path, help="photographs of 540 x 960 px"),
     option("--church", type=Path, help="photographs of 768 x 512 px"),
-    option("--only_table", action="store_true", help="train nothing more"),
 )
+RUNS = (*PHOTOGRAPHS, option("--only_table", action="store_true", help="train nothing more"))
 
 
 def parse(doc: str | None, *options: tuple) -> argparse.Namespace:

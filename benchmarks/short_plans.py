@@ -9,10 +9,9 @@ in a folder and not repeated.
 
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
-from common import option, parse, write_table
+from common import PHOTOGRAPHS, parse, write_table
 from made_up import take_steps
 
 from warp_splat.evaluation.metrics import ssim
@@ -53,17 +52,14 @@ def train(scene: Scene, name: str, factor: float, times: float, seed: int) -> di
 
 
 def main() -> None:
-    arguments = parse(
-        __doc__,
-        option("--runs", type=Path, required=True, help="folder for what has been run"),
-        option("--fox", type=Path, required=True),
-        option("--church", type=Path, required=True),
-    )
+    arguments = parse(__doc__, *PHOTOGRAPHS)
     launch.prepare("cpu", 1)
     arguments.runs.mkdir(parents=True, exist_ok=True)
     places = {"fox": arguments.fox, "church": arguments.church, "embedded": embedded_scene()}
     rows, scenes = [], {}
     for (name, factor, times), seeds in RUNS.items():
+        if not places[name.partition(",")[0]]:
+            continue
         found: dict[float, list] = {1: [], times: []}
         for seed in range(seeds):
             for rate, runs in found.items():

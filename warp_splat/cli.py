@@ -99,7 +99,8 @@ def parse(arguments: list[str]) -> Any:
         flags = [f"--{item.name}" for item in flags_of(config_type)]
         near = difflib.get_close_matches(unknown[0].split("=")[0], flags, 1)
         hint = f"did you mean {near[0]}?" if near else f"warp-splat {known.command} --help lists the flags."
-        raise InputError(f"{unknown[0]}: no such flag; {hint}")
+        what = "no such flag" if unknown[0].startswith("-") else "an argument too many"
+        raise InputError(f"{unknown[0]}: {what}; {hint}")
     values = {name: value for name, value in vars(known).items() if name != "command"}
     for name in NEVER_EMPTY:
         if values.get(name) == "":  # mostly a variable of a shell that was never set
