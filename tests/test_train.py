@@ -198,6 +198,13 @@ def test_bad_options(options, words, tmp_path, fails):
     assert not (tmp_path / "model").exists()
 
 
+def test_no_flag_is_meant_that_there_is_not(fails):
+    """Arguments have no flags."""
+    assert "--folder: no such flag; warp-splat merge --help" in fails("merge", "a", "--folder", "b")
+    assert "did you mean --keep?" in fails("simplify", "a", "--kep", "0.5")
+    assert "-1: an argument too many" in fails("convert", "a", "b.ply", "-1")
+
+
 def test_output_folder_that_cannot_be_written(tmp_path, fails):
     (tmp_path / "file").write_text("in the way")
     for scene in (SCENE, tmp_path / "no scene"):  # said before the scene is loaded

@@ -96,10 +96,10 @@ def parse(arguments: list[str]) -> Any:
     known, unknown = make_parser().parse_known_args(spaced)
     config_type = COMMANDS[known.command][0]
     if unknown:
-        flags = [f"--{item.name}" for item in flags_of(config_type)]
+        flags = [f"--{item.name}" for item in flags_of(config_type) if item.metadata["group"] is not None]
         near = difflib.get_close_matches(unknown[0].split("=")[0], flags, 1)
         hint = f"did you mean {near[0]}?" if near else f"warp-splat {known.command} --help lists the flags."
-        what = "no such flag" if unknown[0].startswith("-") else "an argument too many"
+        what = "no such flag" if re.match("-[^0-9]", unknown[0]) else "an argument too many"
         raise InputError(f"{unknown[0]}: {what}; {hint}")
     values = {name: value for name, value in vars(known).items() if name != "command"}
     for name in NEVER_EMPTY:
