@@ -61,7 +61,9 @@ def contact_sheet(path: str | Path, sections: Mapping[str, Sequence[Row]], colum
     titles = [heading * (bool(title) or number == 0) for number, (title, _) in enumerate(lines)]
     figure = new_figure(WIDTH, heading + sum(heights) + sum(titles) + len(lines) * (text + gap) + margin)
     top = figure.get_figheight()
-    _draw_scale(figure, WIDTH - margin - gap, top - heading + 0.04)
+    axes = figure.add_axes((0, 0, 1, 1), xlim=(0, WIDTH), ylim=(0, top), autoscale_on=False)  # in inches
+    axes.set_axis_off()
+    _draw_scale(axes, WIDTH - margin - gap, top - heading + 0.04)
     lefts = [margin + column * (3 * cell + 2 * gap) for column in range(max(len(line) for _, line in lines))]
     for number, ((title, line), height, extra) in enumerate(zip(lines, heights, titles, strict=True)):
         top -= extra
@@ -76,7 +78,7 @@ def contact_sheet(path: str | Path, sections: Mapping[str, Sequence[Row]], colum
             captions = (_shorten(name, cell), *told, *[""] * (2 - len(told)))
             pictures = (photo, render, _difference(photo, render))
             for place, (picture, caption) in enumerate(zip(pictures, captions, strict=True)):
-                _place_picture(figure, (left + place * cell, top, cell - gap, height), picture, caption)
+                _place_picture(axes, (left + place * cell, top, cell - gap, height), picture, caption)
         top -= gap
     save_figure(figure, path)
 
@@ -190,24 +192,22 @@ def save_figure(figure: Figure, path: str | Path) -> None:
         figure.savefig(temporary)
 
 
-def _place_picture(
-    figure: Figure, box: tuple[float, float, float, float], picture: np.ndarray, title: str, aspect: str = "equal"
-) -> None:
-    """Show ``picture`` in ``box`` = (left, bottom, width, height) [inches], with a title above its left edge."""
-    axes = figure.add_axes(tuple(np.divide(box, [*figure.get_size_inches()] * 2)))
-    axes.imshow(picture, cmap="inferno", vmin=0, vmax=255, aspect=aspect)
-    axes.set_anchor("NW")
-    axes.set_axis_off()
-    axes.set_title(title, loc="left", fontsize=8, color=INK, pad=2.5, parse_math=False)
+def _place_picture(axes: Axes, box: tuple[float, float, float, float], picture: np.ndarray, title: str) -> None:
+    """Show ``picture`` in ``box`` = (left, bottom, width, height) [inches], from its top, and a title above it."""
+    left, bottom, width, height = box
+    inches, top = min(width / picture.shape[1], height / picture.shape[0]), bottom + height
+    place = (left, left + inches * picture.shape[1], top - inches * picture.shape[0], top)
+    axes.imshow(picture, cmap="inferno", vmin=0, vmax=255, aspect="auto", extent=place)
+    _write(axes.figure, left, top + 0.035, title)
 
 
-def _draw_scale(figure: Figure, right: float, bottom: float) -> None:
+def _draw_scale(axes: Axes, right: float, bottom: float) -> None:
     """What the colors of an error mean, ending at ``right`` [inches]."""
     bar, words = 0.8, 0.62  # inches
     start = right - words - bar
-    _write(figure, start - 0.06, bottom, "error, mean of the channels:  0", align="right")
-    _place_picture(figure, (start, bottom, bar, 0.1), np.linspace(0, 255, 256)[None].repeat(2, 0), "", aspect="auto")
-    _write(figure, start + bar + 0.06, bottom, f"{255 / DIFFERENCE_GAIN:.0f} of 255")
+    _write(axes.figure, start - 0.06, bottom, "error, mean of the channels:  0", align="right")
+    _place_picture(axes, (start, bottom, bar, 0.1), np.linspace(0, 255, 256)[None].repeat(32, 0), "")
+    _write(axes.figure, start + bar + 0.06, bottom, f"{255 / DIFFERENCE_GAIN:.0f} of 255")
 
 
 def _write(figure: Figure, left: float, bottom: float, text: str, weight: str = "normal", align: str = "left") -> None:
