@@ -23,7 +23,7 @@ PATIENCE = 300.0  # seconds; a machine may be busy
 #: Densifies, prunes, resets opacities and raises the SH degree within 60 steps.
 SHORT = (
     "--eval -r 4 --iterations 60 --densify_from_iter 10 --densification_interval 10 --densify_until_iter 55 "
-    "--opacity_reset_interval 30 --sh_interval 15 --densify_grad_threshold 0.00005 --quiet"
+    "--opacity_reset_interval 30 --sh_interval 15 --densify_grad_threshold 0.00005 --quiet --test_iterations 3 9 33"
 ).split()
 
 

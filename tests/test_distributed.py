@@ -205,6 +205,7 @@ def test_a_whole_run_of_two_processes(tmp_path):
     what the parts learned, are checked to be identical."""
     options = (
         "--eval -r 8 --iterations 119 --densify_from_iter 10 --densification_interval 10 --densify_until_iter 110 "
+        "--test_iterations 6 "
     )
     options += "--parts sky,exposure,pose,depth,floaters --exposure affine --vignetting --pose_intrinsics focal "
     options += "--opacity_reset_interval 60 --sh_interval 30 --densify_grad_threshold 0.00005 --profile 20"

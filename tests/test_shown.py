@@ -326,7 +326,7 @@ def test_event_files_hold_every_loss(told):
             found.setdefault(value.tag, {})[event.step] = value.simple_value
     history = json.loads((told / "history.json").read_text())
     assert list(found["train/loss"]) == list(range(1, 21))
-    assert found["train/loss"][1] == pytest.approx(history[0]["loss"])
+    assert np.mean([*found["train/loss"].values()]) == pytest.approx(np.mean([record["loss"] for record in history]))
     assert found["gaussians"] == {record["iteration"]: record["gaussians"] for record in history}
     results = json.loads((told / "results.json").read_text())["ours_20"]
     assert found["test/FLIP"][20] == pytest.approx(results["FLIP"])

@@ -33,7 +33,7 @@ def learns(folder):
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
     folder = tmp_path_factory.mktemp("model")
-    assert train(folder, "--test_iterations", "30", "--save_iterations", "40", "--profile", "20") == 0
+    assert train(folder, *"--test_iterations 3 9 30 33".split(), "--save_iterations", "40", "--profile", "20") == 0
     return folder
 
 

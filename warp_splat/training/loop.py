@@ -24,7 +24,7 @@ from warp_splat.training.trainer import Trainer
 if TYPE_CHECKING:
     from warp_splat.training.live import TrainingViewer
 
-EVALUATIONS = 20  # over the run, besides --test_iterations
+EVALUATIONS, APART = 20, 50  # over the run, besides --test_iterations; steps between two, at least
 PROGRESS_VIEWS = 8  # at most, in the evaluations while training
 PREVIEW_SECONDS = 5.0
 KEEP, STOP = 1, 2  # what a process may wish after a step: a checkpoint, an end
@@ -75,7 +75,8 @@ def _do_what_is_due(trainer: Trainer, run: Run, interrupted: list[int], bar: tqd
     keeping_is_due = 0 < 60 * report.checkpoint_interval <= time.perf_counter() - run.kept_at
     wish = processes.largest(STOP if interrupted else KEEP if keeping_is_due else 0)
     stop = wish == STOP or run.iteration >= learn.end
-    some = [learn.iterations * k // EVALUATIONS for k in range(1, EVALUATIONS)]
+    checks = min(EVALUATIONS, learn.iterations // APART)
+    some = [learn.iterations * k // checks for k in range(1, checks)]
     whole = processes.reaches(run.iteration, [*report.test_iterations, learn.end])
     check = whole or processes.reaches(run.iteration, some)
     named = processes.reaches(run.iteration, report.checkpoint_iterations)

@@ -124,7 +124,7 @@ class ReportOptions:
     model_path: str = flag("", "output folder; default: output/<random name>", "-m")
     quiet: bool = flag(False, "print only the summary")
 
-    test_iterations: list[int] = reporting([7_000, 30_000], "evaluate after these steps, and 20 times evenly", many=int)
+    test_iterations: list[int] = reporting([7_000, 30_000], "evaluate after these steps, and up to 20 times", many=int)
     save_iterations: list[int] = reporting([7_000, 30_000], "save the model after these steps, and the last", many=int)
     checkpoint_iterations: list[int] = reporting([], "keep a checkpoint of these steps, besides the last one", many=int)
     checkpoint_interval: float = reporting(5.0, "minutes between checkpoints (one stays); 0: only at start and end")
