@@ -16,6 +16,7 @@ from filelock import FileLock
 from warp_splat import get_threads, set_threads
 from warp_splat.cli import main
 from warp_splat.config import RasterOptions
+from warp_splat.evaluation import report
 from warp_splat.export_html import command, pack
 from warp_splat.kernels import ssim
 from warp_splat.kernels.cpu.adjoint import make_reverse
@@ -31,6 +32,7 @@ from warp_splat.scene import load_scene
 from warp_splat.scene.embedded import embedded_scene
 
 pool.SMALLEST_SLICE = 256  # so that threads share small scenes, too
+report.DPI = 50  # so that the pictures of a training take a third of the time
 # Tests start dozens of processes: what one has compiled of torch serves the next.
 sys.dont_write_bytecode = False
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)

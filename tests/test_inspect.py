@@ -20,8 +20,9 @@ from warp_splat.training.plan import StepTime
 
 
 @pytest.fixture
-def life(tmp_path):
-    """A copy of the embedded scene that may be damaged."""
+def life(tmp_path, monkeypatch):
+    """A copy of the embedded scene that may be damaged, of which one step of each kind is tried."""
+    monkeypatch.setattr(deadline, "REPEATS", 1)
     shutil.copytree(SCENE, tmp_path / "life")
     return tmp_path / "life"
 

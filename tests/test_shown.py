@@ -25,6 +25,14 @@ from warp_splat.formats.png import load_png, save_png, save_video
 from warp_splat.text import format_table, table_of
 
 
+@pytest.fixture(scope="module", autouse=True)
+def sharp():
+    """Pictures as users see them."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(report, "DPI", 200)
+        yield
+
+
 def view(name="0001.jpg", height=60, width=80, gap=8):
     photo = np.zeros((height, width, 3), np.uint8)
     return name, photo, photo + np.uint8(gap), "30.00 dB"
