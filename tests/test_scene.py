@@ -148,6 +148,8 @@ def test_eval_holds_out_every_eighth(tmp_path, count):
         ("RADIAL", radial, (150, 150), (0.1, -0.03)),
         ("OPENCV", radial, (150, 156), (-0.15, 0.04, 0.002, -0.003)),
         ("OPENCV_FISHEYE", fisheye, (110, 112), (0.02, -0.01, 0.003, 0.0)),
+        ("OPENCV_FISHEYE", fisheye, (150, 156), (0.0, 0.0, 0.0, 0.0)),
+        ("SIMPLE_RADIAL_FISHEYE", fisheye, (150, 150), (0.0,)),
         ("FULL_OPENCV", radial, (150, 156), (-0.1, 0.03, 0.002, 0.001, -0.01, 0.02, 0.01, 0.003)),
         ("SIMPLE_RADIAL_FISHEYE", fisheye, (150, 150), (0.02,)),
         ("RADIAL_FISHEYE", fisheye, (150, 150), (0.02, -0.01)),

@@ -46,6 +46,19 @@ def test_transforms_intrinsics_of_frames_go_before_those_of_the_file(tmp_path):
     assert [(c.fx, c.fy, c.cx, c.cy) for c in cameras] == [(40, 44, 22.5, 17.25), (50, 51, 20, 17.25)]
 
 
+def test_a_frame_with_a_focal_length_of_its_own_takes_none_of_the_file(tmp_path):
+    own = [{}, {"camera_angle_x": 1.0}, {"fl_x": 50.0}]
+    scene, _ = load(write_transforms(tmp_path, ["a.png", "b.png", "c.png"], frame=lambda index: own[index]))
+    found = [value for view in scene.train for value in (view.camera.fx, view.camera.fy)]
+    assert found == pytest.approx([40, 44, *[0.5 * WIDTH / np.tan(0.5)] * 2, 50, 50])
+
+
+@pytest.mark.parametrize("fisheye", [True, 1])
+def test_a_fisheye_of_instant_ngp(tmp_path, fisheye):
+    (view, *_) = load(write_transforms(tmp_path, is_fisheye=fisheye), lens="native")[0].train
+    assert view.camera.lens.model == "OPENCV_FISHEYE"
+
+
 def test_transforms_angles_of_both_axes(tmp_path):
     root = write_transforms(tmp_path, camera_angle_x=1.0, camera_angle_y=0.8)
     content = json.loads((root / "transforms.json").read_text())
@@ -157,6 +170,8 @@ BAD = {
     "k4": (broken(k1=0.1, k4=0.1), ["frame 0", "OPENCV", "k4 = 0.1"]),
     "fisheye-p1": (broken(camera_model="OPENCV_FISHEYE", p1=0.1), ["frame 0", "p1 = 0.1"]),
     "model": (broken(camera_model="EQUIRECTANGULAR"), ["frame 0", "EQUIRECTANGULAR"]),
+    "fisheye-text": (broken(is_fisheye="true"), ["frame 0: expected is_fisheye as true or false, got 'true'"]),
+    "latlong": (broken(latlong=True), ["frame 0: expected a lens without latlong, got True"]),
     "model-list": (broken(camera_model=[1]), ["frame 0", "camera_model"]),
     "focal": (broken(fl_x="wide"), ["frame 0: expected fl_x as a number between", "'wide'"]),
     "focal-0": (broken(fl_x=0), ["fx", "positive"]),

@@ -72,7 +72,7 @@ def make_photo(
                 f"{lens.model} {list(lens.params)}; correct the model, leave this image out, or keep its lens "
                 "(--lens native)."
             )
-        if loaded.is_undistorted():
+        if loaded.is_undistorted() and "FISHEYE" not in lens.model:  # of those it means: no more than its angles
             return Photo(name, path, _pinhole(loaded, pose).resized(*size))
         resample = functools.partial(sampling, lens, size)
         return Photo(name, path, _pinhole(_undistorted(lens, size), pose), resample, model=lens.model)

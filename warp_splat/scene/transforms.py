@@ -29,6 +29,8 @@ JSON_BYTES = 2**24  # of 20,000 frames; no JSON of this size takes more than a g
 LARGEST = 1e9  # of a number that describes a lens
 PERSPECTIVE = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "PERSPECTIVE")
 FISHEYE, PANORAMA = "OPENCV_FISHEYE", "EQUIRECTANGULAR"
+UNKNOWN = ("latlong", "ftheta_p0")  # lenses of instant-ngp
+FOCAL = {"fl_x", "fl_y", "camera_angle_x", "camera_angle_y"}  # a frame that has one of them takes none of the file's
 
 
 def has_transforms(source: Path) -> bool:
@@ -89,7 +91,8 @@ def _read_photos(path: Path, content: dict[str, Any], report: Report, native: bo
         if found in seen:  # it might be trained on and held out at once
             again.append(name)
             continue
-        photos[name] = _photo({**content, **frame}, found, finder, sampling, where)
+        shared = {key: content[key] for key in content if key not in FOCAL or not FOCAL & frame.keys()}
+        photos[name] = _photo({**shared, **frame}, found, finder, sampling, where)
         seen.add(found)
     if again:
         report(f"Leaving out {len(again)} of {len(names)} frames, whose photographs had one before: {few(again)}.")
@@ -168,7 +171,11 @@ def _lens(values: dict[str, Any], size: tuple[int, int], where: str) -> Calibrat
     fy = focal_of("y", height) if "fl_y" in values or ("fl_x" not in values and "camera_angle_y" in values) else fx
     focal = (fx, fy, number("cx", width / 2), number("cy", height / 2))
     k1, k2, k3, k4, p1, p2 = (number(key) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
-    model = values.get("camera_model", FISHEYE if values.get("is_fisheye") is True else "OPENCV")
+    if (fisheye := values.get("is_fisheye") or False) not in (True, False):
+        raise _wrong(where, "is_fisheye as true or false", fisheye)
+    if other := [key for key in UNKNOWN if values.get(key)]:
+        raise _wrong(where, f"a lens without {other[0]}", values[other[0]])
+    model = values.get("camera_model", FISHEYE if fisheye else "OPENCV")
     if model == FISHEYE and not (p1 or p2):
         params = (*focal, k1, k2, k3, k4)
     elif model in PERSPECTIVE and not k4:
