@@ -17,7 +17,7 @@ from warp_splat.gaussians import GaussianModel
 from warp_splat.raster.api import render
 from warp_splat.runtime.distributed import ALONE
 from warp_splat.training.growth.budget import SMALLER, Budget, halves
-from warp_splat.training.growth.mcmc import Mcmc, crowds
+from warp_splat.training.growth.mcmc import EXTENT, Mcmc, crowds
 from warp_splat.training.growth.reference import Reference
 from warp_splat.training.optimizer import Optimizer
 from warp_splat.training.options import TrainConfig
@@ -200,15 +200,15 @@ def test_processes_add_what_they_saw(monkeypatch):
         assert torch.equal(tensor, first.model.parameters[name])
 
 
-def mcmc_on(count, budget, iterations=1000, **raw):
+def mcmc_on(count, budget, iterations=1000, extent=EXTENT, **raw):
     """A growth of equal Gaussians; of ``raw``, parameters before activation."""
     rows = {"means": [0.0] * 3, "scales": [0.0] * 3, "quats": [1.0, 0, 0, 0], "opacities": 0.0}
     rows = {name: torch.tensor(value).repeat(count, *[1] * np.ndim(value)) for name, value in rows.items()}
     rows |= {"sh_dc": torch.arange(3.0 * count).view(count, 1, 3), "sh_rest": torch.zeros(count, 0, 3)}
     rows |= {name: torch.as_tensor(value, dtype=torch.float32).expand_as(rows[name]) for name, value in raw.items()}
     model, config = GaussianModel(rows), TrainConfig(growth="mcmc")
-    setting = Setting(SimpleNamespace(extent=1.0), model, torch.zeros(3), ALONE, 0, budget, iterations)
-    return model, Mcmc(config.plugins["mcmc"], setting, Optimizer(model, config.learn, 1.0))
+    setting = Setting(SimpleNamespace(extent=extent), model, torch.zeros(3), ALONE, 0, budget, iterations)
+    return model, Mcmc(config.plugins["mcmc"], setting, Optimizer(model, config.learn, extent / EXTENT))
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 7, 60])
@@ -255,6 +255,19 @@ def test_faint_ones_move_by_their_covariance_and_others_stay(driver):
     assert not moved[-1].any()
     assert np.abs(np.cov(moved[:-1].T) - expected).max() < 0.03 * np.abs(expected).max()
     assert np.abs(moved[:-1].mean(0)).max() < 0.03 * np.sqrt(np.abs(expected).max())
+
+
+def test_the_unit_of_length_does_not_matter():
+    """Of a scene 64 times as large, noise is 64 times as large, and prices are the same."""
+    found = []
+    for times in (1.0, 64.0):
+        scales = np.array([-3.0, -2.0, -1.0]) + np.log(times)
+        model, growth = mcmc_on(5, 5, extent=times * EXTENT, scales=scales, opacities=-4.4)
+        growth.optimizer.set_iteration(0)
+        price = growth.price(model.activated()).item()
+        growth.after_step(1)
+        found.append([price, *(model.parameters["means"].detach() / times).ravel().tolist()])
+    assert found[1] == pytest.approx(found[0], rel=1e-5) and found[0][1] != 0
 
 
 def test_prices_on_opacity_and_size():

@@ -25,6 +25,7 @@ NOISE = 5e5  # times the means' rate and the covariance
 SHARPNESS = 100.0  # of the fall of the noise around the opacity at which a Gaussian is dead
 STILL = 0.15  # opacity from which on the noise is below 1e-6 of the largest, and left out
 PRICE_OPACITY, PRICE_SCALE = 0.01, 0.01  # in the loss
+EXTENT = 4.0  # world units: about that of scenes from COLMAP, as the paper's; lengths of others count in its unit
 GAIN = 0.05  # share by which the set grows at once
 DRAWS = 2**53  # levels of a uniform random number
 ROUNDS = 60  # of Newton's method for a root, from above: 1e-12 to the power 1 / n is found for every n
@@ -38,7 +39,7 @@ class Mcmc:
 
     def __init__(self, options: ReferenceOptions, setting: Setting, optimizer: Optimizer):
         self.options, self.setting, self.optimizer = options, setting, optimizer
-        self.model, self.processes = setting.model, setting.processes
+        self.model, self.processes, self.unit = setting.model, setting.processes, setting.scene.extent / EXTENT
         self.random = torch.Generator().manual_seed(setting.seed)
         check_budget("mcmc", setting.max_gaussians, self.processes.total(len(self.model)))
 
@@ -47,7 +48,7 @@ class Mcmc:
         opacities, scales = gaussians.opacities, gaussians.scales
         count = max(self.processes.total(len(self.model)), 1)
         price = PRICE_OPACITY * in_pairs(opacities.nan_to_num()) / count
-        return price + PRICE_SCALE * in_pairs(scales.nan_to_num().reshape(-1)) / (3 * count)
+        return price + PRICE_SCALE / self.unit * in_pairs(scales.nan_to_num().reshape(-1)) / (3 * count)
 
     @torch.no_grad()
     def after_step(self, iteration: int) -> None:
@@ -64,7 +65,8 @@ class Mcmc:
         scales, quats, opacities = scales[faint], raw["quats"].detach()[faint], opacities[faint]
         gate = activate(scales, SHARPNESS * (PRUNE_OPACITY - opacities))[1] * (opacities < STILL)
         # the covariance R S S R' times a normal vector is R S S times another
-        moved = rotate(quats, scales * scales * drawn) * (NOISE * self.optimizer.tables["means"].rate * gate)[:, None]
+        rate = NOISE * self.optimizer.tables["means"].rate / self.unit**2
+        moved = rotate(quats, scales * scales * drawn) * (rate * gate)[:, None]
         means = raw["means"].detach()
         means[faint] = means[faint] + moved.nan_to_num(0.0, 0.0, 0.0)
 
