@@ -134,6 +134,24 @@ def test_a_photograph_that_cannot_be_read_is_told_and_ends_nothing(viewer, monke
     assert drawn(viewer) >= 1 and client.frames and "complete image file" not in looks.note.content
 
 
+@pytest.mark.parametrize(
+    "error", [InputError("too many tiles"), MemoryError(), torch.OutOfMemoryError("CUDA")], ids=str
+)
+def test_a_frame_that_cannot_be_drawn_is_told_and_ends_nothing(viewer, monkeypatch, error):
+    at_rest(monkeypatch)
+    client, looks, draw = entered(viewer, size=(120, 60)), viewer.watchers[1], viewer.draw_camera
+
+    def fail(*_, **__):
+        raise error
+
+    viewer.draw_camera = fail
+    assert drawn(viewer) == 1 and not client.frames
+    assert "too many tiles" in looks.note.content or "Out of memory on cpu" in looks.note.content
+    viewer.draw_camera = draw
+    viewer.refresh()
+    assert drawn(viewer) == 1 and client.frames
+
+
 def picture_of(viewer, camera):
     image = viewer.draw_camera(camera, False).image
     return (image.clamp(0, 1) * 255).round().byte().numpy()
@@ -184,12 +202,12 @@ def test_one_that_leaves_while_its_frame_is_drawn(viewer):
     assert drawn(viewer) == 1 and client.frames == []
 
 
-@pytest.mark.parametrize("size", [(0, 0), (100_000, 100_000)])
+@pytest.mark.parametrize("size", [(0, 0), (60_000, 60_000), (70_000, 2)])
 def test_windows_of_strange_sizes(viewer, monkeypatch, size):
     at_rest(monkeypatch)
     client = entered(viewer, size=size)
     assert drawn(viewer) == 1
-    assert [frame.shape[0] * frame.shape[1] <= MOST for frame, _ in client.frames] == [True] * (size != (0, 0))
+    assert [frame.shape[0] * frame.shape[1] <= MOST for frame, _ in client.frames] == [True] * (0 < size[0] < 65_000)
 
 
 @pytest.mark.parametrize("count", [0, 1])

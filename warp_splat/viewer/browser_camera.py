@@ -14,7 +14,7 @@ from warp_splat.errors import InputError
 SAME_ANGLE = 0.002  # rad
 SAME_PLACE = 0.002  # of the distance to what one looks at
 USUAL_WINDOW = (16, 9)
-MOST_PIXELS = 1 << 20  # along an edge
+MOST_PIXELS = 65_000  # along an edge; JPEG has 65,535
 VIEW_ANGLE = 0.9  # rad, vertical field of view where no camera says another
 
 Box = tuple[slice, slice]  # rows and columns of a window

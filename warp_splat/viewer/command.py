@@ -7,11 +7,9 @@ from warp_splat.errors import InputError
 from warp_splat.gaussians import GaussianModel
 from warp_splat.raster.selftest import settle_device
 from warp_splat.rendering.finished import Finished
-from warp_splat.runtime.devices import memory_explained
 from warp_splat.runtime.interrupts import interruptible
 from warp_splat.scene.types import Scene
 from warp_splat.viewer.server import AS_GIVEN, Viewer, free_port
-from warp_splat.viewer.watcher import LARGEST
 
 
 def view_model(config: ViewConfig) -> int:
@@ -30,15 +28,13 @@ def view_model(config: ViewConfig) -> int:
     scene = _find_scene(finished, config.source_path)
     options = replace(finished.options, of="trained", tolerance=config.tolerance or None)
     print("Preparing kernels (compiled once on a machine, about 20 s) ...")
-    advice = "view a model with fewer Gaussians (train with --max_gaussians), or a smaller window"
-    with memory_explained(device, model, [LARGEST], advice):
-        draw, linear = finished.renderer(model, options), finished.is_linear(scene)
-        exposures = lambda: finished.exposures  # noqa: E731
-        with Viewer(draw, model, scene, config.port, linear, exposures) as viewer, interruptible() as interrupted:
-            print(f"{viewer.announcement}; Ctrl-C ends it", flush=True)
-            while not interrupted:
-                if not viewer.draw():
-                    viewer.wait()
+    draw, linear = finished.renderer(model, options), finished.is_linear(scene)
+    exposures = lambda: finished.exposures  # noqa: E731
+    with Viewer(draw, model, scene, config.port, linear, exposures) as viewer, interruptible() as interrupted:
+        print(f"{viewer.announcement}; Ctrl-C ends it", flush=True)
+        while not interrupted:
+            if not viewer.draw():
+                viewer.wait()
     return 0
 
 

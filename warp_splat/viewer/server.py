@@ -23,10 +23,11 @@ from warp_splat.gaussians import GaussianModel
 from warp_splat.raster.api import RenderOutput
 from warp_splat.rendering.camera_paths import focus_point
 from warp_splat.rendering.finished import as_photographed
+from warp_splat.runtime.devices import memory_explained
 from warp_splat.scene.types import Scene, View
 from warp_splat.viewer.browser_camera import look_at_all, look_from
 from warp_splat.viewer.picture import KINDS, overlay, paint
-from warp_splat.viewer.watcher import MOST, Watcher, pixels_after
+from warp_splat.viewer.watcher import LARGEST, MOST, Watcher, pixels_after
 
 if TYPE_CHECKING:
     import viser
@@ -155,20 +156,11 @@ class Viewer:
         start = time.perf_counter()
         watcher.changed, watcher.sharp, watcher.drawn_at = False, not moving, time.monotonic()
         try:
-            camera, view, box = watcher.camera(watcher.pixels if moving else MOST)
-            watcher.ruler.answer(self.draw_camera, camera, self.unit)
-            photograph = view.picture if view is not None and watcher.opacity.value > 0 else None
-        except InputError as error:  # of a window that was folded up, a lens, or a photograph that cannot be read
+            with memory_explained(self.model.device, self.model, [LARGEST], "look from farther away"):
+                frame, note = self._frame(watcher, watcher.pixels if moving else MOST)
+        except InputError as error:  # a folded window, a lens, no memory, a photograph that cannot be read
             watcher.note.content = str(error)
             return
-        kind = watcher.kind.value
-        out = self.draw_camera(camera, kind == "depth")
-        if view is not None:
-            name = view.name.removesuffix(AS_GIVEN)
-            out.image[box] = as_photographed(out.image[box].clone(), self.exposures(), name)
-        frame, note = paint(out, kind, self.linear)
-        if photograph is not None:
-            frame = overlay(frame, photograph, box, watcher.opacity.value)
         if watcher.client.client_id not in self.watchers:
             return
         quality = MOVING_QUALITY if moving else SHARP_QUALITY
@@ -176,10 +168,24 @@ class Viewer:
         watcher.client.flush()
         seconds = time.perf_counter() - start
         if moving:
-            watcher.pixels = pixels_after(seconds, camera.width * camera.height)
+            watcher.pixels = pixels_after(seconds, frame.shape[0] * frame.shape[1])
         else:
-            size = f"{camera.width} x {camera.height} px in {1e3 * seconds:.0f} ms"
+            size = f"{frame.shape[1]} x {frame.shape[0]} px in {1e3 * seconds:.0f} ms"
             watcher.note.content = "  \n".join([size, *filter(None, [note])])
+
+    def _frame(self, watcher: Watcher, pixels: float) -> tuple[np.ndarray, str]:
+        """What ``watcher`` sees, of at most ``pixels``, and a note on it."""
+        camera, view, box = watcher.camera(pixels)
+        watcher.ruler.answer(self.draw_camera, camera, self.unit)
+        kind = watcher.kind.value
+        out = self.draw_camera(camera, kind == "depth")
+        if view is not None:
+            name = view.name.removesuffix(AS_GIVEN)
+            out.image[box] = as_photographed(out.image[box].clone(), self.exposures(), name)
+        frame, note = paint(out, kind, self.linear)
+        if view is not None and watcher.opacity.value > 0:
+            frame = overlay(frame, view.picture, box, watcher.opacity.value)
+        return frame, note
 
 
 def free_port(port: int) -> int:
