@@ -21,7 +21,7 @@ from warp_splat.formats.png import load_png
 from warp_splat.raster import drivers
 from warp_splat.raster.api import render
 from warp_splat.raster.data import Gaussians
-from warp_splat.rendering.command import write_maps
+from warp_splat.rendering.command import save_exr, write_maps
 from warp_splat.scene.types import Decoded, View
 
 RENDERED = [case for case in cases.CASES if case.build]
@@ -223,7 +223,7 @@ def test_gradients_within_a_tolerance():
         assert (cut - whole).norm() < 2e-3 * whole.norm()
 
 
-def test_pictures_of_the_bound(tmp_path):
+def test_pictures_of_the_bound(tmp_path, monkeypatch):
     gaussians, camera = ordinary()
     out = render(gaussians, camera, torch.zeros(3), RasterOptions(bound=True))
     photo = np.zeros((camera.height, camera.width, 3), np.uint8)
@@ -233,6 +233,10 @@ def test_pictures_of_the_bound(tmp_path):
     assert np.array_equal(read[..., 0], out.bound.numpy())
     height, width, _ = load_png(tmp_path / "bound" / "00000.png").shape
     assert height == camera.height and width > camera.width  # the scale is beside it
+    monkeypatch.setattr(oiio.ImageOutput, "close", lambda self: False)  # as of a disk that is full at the end
+    with pytest.raises(InputError, match="it cannot be written"):
+        save_exr(tmp_path / "half.exr", np.zeros((4, 4)))
+    assert not list(tmp_path.glob("*.exr"))
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
-from commands import SCENE
+from commands import SCENE, no_space
 from scene_files import HEIGHT, WIDTH, texture, write_blender, write_colmap, write_image, write_transforms
 from test_scene_input import BAD
 
@@ -216,6 +216,12 @@ def test_cameras_at_one_place_or_far_away(tmp_path, capsys, far, apart, words):
     lines: list[str] = []
     load_scene(tmp_path / "a", report=lines.append)
     assert any(words in line for line in lines) == bool(far)
+
+
+def test_a_page_that_cannot_be_written_loses_no_verdict(life, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("warp_splat.inspect.command.draw_pictures", lambda subject: ())
+    monkeypatch.setattr("warp_splat.inspect.command.write_page", no_space)
+    assert examine(life, tmp_path, capsys, 1)[0]
 
 
 def test_a_scene_so_small_that_little_of_it_is_drawn(life, tmp_path, capsys, monkeypatch):

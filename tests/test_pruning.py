@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from commands import changes_told
+from commands import changes_told, no_space
 from scenes import C0, SCENES
 from scipy.spatial.transform import Rotation
 
@@ -329,6 +329,22 @@ def test_clean_reports_before_and_after(folder, tmp_path, capsys):
     assert gain >= 0.01 and (tmp_path / "b.sheet.png").stat().st_size > 10_000
     found = load_gaussians(output).splats.means
     assert np.abs(found - planted.means[-1]).max(axis=1).min() > 1e-3
+
+
+def test_a_full_disk_loses_no_result(folder, tmp_path, monkeypatch, capsys):
+    """That of the output, and then that for temporary files, where sizes are tried."""
+    (model, splats), spare = folder, tmp_path / "spare"
+    spare.mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(spare))
+    for code, full, place in ((1, "out", spare), (0, spare.name, tmp_path / "out")):
+        write = lambda path, *rest, full=full: (no_space if full in str(path) else save_gaussians)(path, *rest)  # noqa: E731
+        monkeypatch.setattr("warp_splat.pruning.opened.save_gaussians", write)
+        assert main(["clean", str(model), "-o", str(tmp_path / "out" / "a.ply"), "--device", "cpu"]) == code
+        (saved,) = place.rglob("a.ply")
+        out = capsys.readouterr().out
+        assert f"{saved}: " in out and (" MB" in out) == (place == spare) and "train PSNR" in out
+        assert 0 < len(load_gaussians(saved).splats.means) <= len(splats.means)
+        saved.unlink()
 
 
 @pytest.mark.parametrize(("text", "wanted"), [("10MB", 10**7), ("500 kB", 500_000), ("1.5g", 1_500_000_000), ("7", 7)])

@@ -8,6 +8,8 @@ import errno
 import io
 import json
 import os
+import sys
+import tempfile
 import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -108,6 +110,25 @@ def write_csv(path: str | Path, rows: Sequence[Mapping]) -> None:
         writer = csv.DictWriter(file, list(dict.fromkeys(key for row in rows for key in row)))
         writer.writeheader()
         writer.writerows(rows)
+
+
+def save_somewhere(path: Path, save: Callable[[Path], object], name: str = "") -> Path:
+    """Let ``save`` write a file; if that fails, into the system's folder for temporary files, as ``name`` or its own.
+
+    Returns:
+        Where it is.
+
+    Raises:
+        InputError: if that fails, too.
+    """
+    try:
+        save(path)
+    except InputError as error:
+        print(f"warning: {error}", file=sys.stderr)
+        path = Path(tempfile.mkdtemp(prefix="warp_splat-")) / (name or path.name)
+        save(path)
+        print(f"It was saved as {path} instead.", file=sys.stderr)
+    return path
 
 
 LARGEST_RATIO = 64  # of packed to compressed bytes; files of real scenes reach 3

@@ -40,10 +40,10 @@ def inspect(config: InspectConfig) -> int:
     findings += check_cost(subject, print)
     findings.sort(key=lambda finding: list(COLORS).index(finding.level))
     verdict = _verdict(findings)
-    write_page(page, f"Scene {source}", verdict, findings, draw_pictures(subject))
     shown = "\033[{1}m{0:7s}\033[0m" if sys.stdout.isatty() else "{0:7s}"
     for finding in findings:
         print(f"{shown.format(finding.level, COLORS[finding.level])}  {finding.check:13s} {finding.text}")
+    write_page(page, f"Scene {source}", verdict, findings, draw_pictures(subject))
     print(f"{source}: {verdict} ({time.perf_counter() - started:.1f} s)\n  page {page}")
     return int(any(finding.level == "error" for finding in findings))
 

@@ -16,7 +16,7 @@ from warp_splat.color import from_srgb, to_srgb
 from warp_splat.config import STRONGEST_MOST, MeshConfig
 from warp_splat.errors import InputError, imported
 from warp_splat.formats.exposures import Exposures
-from warp_splat.formats.files import write_bytes
+from warp_splat.formats.files import save_somewhere, write_bytes
 from warp_splat.formats.model_folder import check_output
 from warp_splat.gaussians import GaussianModel
 from warp_splat.meshing.fusion import HALF, Drawn, Surface, agreed, depth_of, image_at, pixel, surface_of, voxels_of
@@ -73,14 +73,14 @@ def mesh(config: MeshConfig) -> int:
     if config.crop:  # smoothing and simplifying move vertices
         surface = surface._replace(vertices=surface.vertices.clip(*np.reshape(config.crop, (2, 3))))
     whole = trimesh_of(surface)
-    write_bytes(output, exported(whole, output.suffix))
+    output = save_somewhere(output, lambda place: write_bytes(place, exported(whole, place.suffix)))
     least = ", the fewest that simplifying comes to" if 0 < config.triangles < 0.9 * len(surface.faces) else ""
     print(f"{output}: {len(surface.faces)} of {found} triangles{least}, voxels of {voxel:.4g}")
     if config.collision:
         pieces = needed("trimesh").Scene(whole.convex_decomposition(maxConvexHulls=config.collision))  # V-HACD
         write_bytes(pieces_place, exported(pieces, output.suffix))
         print(f"{pieces_place}: {len(pieces.geometry)} convex pieces")
-    return 0
+    return int(output != Path(config.output))
 
 
 def needed(package: str) -> Any:

@@ -42,12 +42,12 @@ def clean(config: CleanConfig) -> int:
         trained = {**opened.trained, "parts": ",".join(sorted(parts))}
         left = file._replace(splats=splats)
         splats = tuned(opened.scene, left, opened.setting, len(splats.means), config.steps, trained)
-    write(output, opened, splats)
+    code = write(output, opened, splats)
     print_quality(opened.quality(before), opened.quality(splats))
     sheet = output.with_suffix(".sheet.png")
     _draw(opened, before, splats, sheet)
     print(f"  the views that changed most, before and after: {sheet}")
-    return 0
+    return code
 
 
 def floaters(splats: SplatArrays, setting: ViewSetting, views: float, near: float) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 import tempfile
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -14,6 +15,7 @@ from warp_splat.config import CleanConfig, FinishedModel, SimplifyConfig
 from warp_splat.errors import InputError
 from warp_splat.evaluation.metrics import psnr
 from warp_splat.formats.exchange import format_of, save_gaussians
+from warp_splat.formats.files import save_somewhere
 from warp_splat.formats.model_folder import check_output, is_file_of_gaussians
 from warp_splat.formats.splats import SplatArrays, SplatFile, cropped, within
 from warp_splat.formats.stored import SH_C0
@@ -118,15 +120,17 @@ def written_bytes(name: Path, file: SplatFile) -> int:
         return sum(path.stat().st_size for path in Path(folder).iterdir())
 
 
-def write(path: Path, finished: Finished, splats: SplatArrays) -> None:
-    """Write ``splats`` in place of those of a model, and print what that saved, and lost."""
+def write(path: Path, finished: Finished, splats: SplatArrays) -> int:
+    """Write ``splats`` in place of those of a model, and print what that saved, and lost; 1 if they are elsewhere."""
     before, notes = finished.placed(), finished.beyond_files
-    after = before._replace(splats=splats)
-    save_gaussians(path, after, notes.append)
-    old, new = written_bytes(path, before), written_bytes(path, after)
-    print(f"{path}: {len(splats.means)} of {len(before.splats.means)} Gaussians, {new / 1e6:.2f} of {old / 1e6:.2f} MB")
+    after, size = before._replace(splats=splats), ""
+    saved = save_somewhere(path, lambda place: save_gaussians(place, after, notes.append))
+    with suppress(InputError):  # of the folder for temporary files
+        size = f", {written_bytes(path, after) / 1e6:.2f} of {written_bytes(path, before) / 1e6:.2f} MB"
+    print(f"{saved}: {len(splats.means)} of {len(before.splats.means)} Gaussians{size}")
     if notes:
-        print(f"  lost: {'; '.join(notes)}")
+        print(f"  lost: {'; '.join(dict.fromkeys(notes))}")
+    return int(saved != path)
 
 
 def print_quality(before: dict[str, float], after: dict[str, float]) -> None:

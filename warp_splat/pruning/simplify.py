@@ -70,7 +70,7 @@ def simplify(config: SimplifyConfig) -> int:
     if config.size and config.steps:  # trained numbers are harder to pack
         thinning = Thinning(splats, opened.setting)
         splats = thinning.to(_count(config, output, file._replace(splats=splats), thinning.to))
-    write(output, opened, splats)
+    code = write(output, opened, splats)
     if config.tolerance:
         measured, bound = changed(splats)
         found = f"{measured:.2g} measured, {upward(bound)} its bound"
@@ -81,7 +81,7 @@ def simplify(config: SimplifyConfig) -> int:
     print(f"  harmonics: {', '.join(f'{number} of degree {degree}' for degree, number in enumerate(numbers))}")
     print_quality(opened.quality(file.splats), opened.quality(splats))
     print(f"  what each share costs: {output.with_suffix('.curve.png')}, .csv")
-    return 0
+    return code
 
 
 def degrees_of(splats: SplatArrays) -> np.ndarray:
@@ -195,5 +195,4 @@ def _unseen(config: SimplifyConfig, output: Path) -> int:
     order = np.argsort(-sizes(file.splats), kind="stable")
     keep = lambda count: file.splats.take(np.sort(order[:count]))  # noqa: E731
     count = _count(config, output, file, keep)
-    write(output, finished, keep(count))
-    return 0
+    return write(output, finished, keep(count))

@@ -23,6 +23,7 @@ from warp_splat.evaluation.perceptual import choose_metrics
 from warp_splat.evaluation.report import save_figure
 from warp_splat.evaluation.views import evaluate_views, metrics_line, show_views, write_views
 from warp_splat.formats import model_folder
+from warp_splat.formats.files import atomic_write
 from warp_splat.formats.png import save_png, save_video
 from warp_splat.gaussians import GaussianModel
 from warp_splat.raster.selftest import settle_device
@@ -74,9 +75,11 @@ def save_exr(path: Path, values: np.ndarray) -> None:
     """
     spec = oiio.ImageSpec(values.shape[1], values.shape[0], 1, "float")
     spec.attribute("DateTime", "1970:01:01 00:00:00")  # else that of writing, and other bytes
-    output = oiio.ImageOutput.create(str(path))
-    if not (output and output.open(str(path), spec) and output.write_image(values[..., None]) and output.close()):
-        raise InputError(f"{path}: it cannot be written: {oiio.geterror() or output.geterror()}; name another folder.")
+    with atomic_write(path) as new:
+        output = oiio.ImageOutput.create(str(new))
+        if not (output and output.open(str(new), spec) and output.write_image(values[..., None]) and output.close()):
+            found = oiio.geterror() or output.geterror()
+            raise InputError(f"{path}: it cannot be written: {found}; name another folder.")
 
 
 OTHER_VIDEOS = {".avi", ".gif", ".m4v", ".mkv", ".mov", ".mpg", ".webm", ".wmv"}

@@ -3,7 +3,6 @@
 import hashlib
 import shlex
 import sys
-import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -21,7 +20,7 @@ from warp_splat.formats import model_folder
 from warp_splat.formats.checkpoint import LAST, Checkpoint, save_checkpoint, save_in_blocks
 from warp_splat.formats.colmap_text import write_colmap
 from warp_splat.formats.exposures import write_exposures
-from warp_splat.formats.files import write_json
+from warp_splat.formats.files import save_somewhere, write_json
 from warp_splat.runtime.devices import peak_memory
 from warp_splat.runtime.distributed import Processes
 from warp_splat.scene.blocks import write_block
@@ -64,14 +63,8 @@ def warn(error: Exception) -> None:
 
 def save_model(trainer: Trainer, run: Run) -> Path:
     """Save the model; if that fails, into the system's folder for temporary files, rather than lose it."""
-    path = model_folder.ply_path(run.folder, run.iteration)
-    try:
-        trainer.save(path)
-    except InputError as error:
-        warn(error)
-        path = Path(tempfile.mkdtemp(prefix="warp_splat-")) / f"iteration_{run.iteration}.ply"
-        trainer.save(path)
-        tqdm.write(f"The model was saved as {path} instead.", file=sys.stderr)
+    own = model_folder.ply_path(run.folder, run.iteration)
+    path = save_somewhere(own, trainer.save, f"iteration_{run.iteration}.ply")
     try:
         _save_cameras(trainer, run.folder, path.parent)
         behind = trainer.behind.cpu().numpy()
