@@ -27,6 +27,7 @@ from warp_splat.scene.gains import gains_of
 from warp_splat.scene.neighbors import guessed
 from warp_splat.scene.types import Decoded
 from warp_splat.training.options import TrainConfig
+from warp_splat.training.parts import exposure
 from warp_splat.training.record import save_model
 from warp_splat.training.trial import weigh
 from warp_splat.viewer import server
@@ -278,6 +279,19 @@ def test_render_shows_photographs_as_they_were_taken(trained, capsys, monkeypatc
     expected = 1.5 * (neutral[1] / 255 + 0.055) - 0.055
     assert np.abs(renders[1] / 255 - expected.clip(0, 1)).max() < 1.5 / 255
     assert np.array_equal(renders[0], neutral[0])
+
+
+def test_held_out_exposures_are_guessed_once_after_each_step(tmp_path, monkeypatch):
+    calls, guess = [], exposure.guessed
+    monkeypatch.setattr(exposure, "guessed", lambda *given: calls.append(1) or guess(*given))
+    scene = load_scene(SCENE, resolution=8, eval=True)
+    trainer, run = begin(scene, tmp_path, parts="exposure")
+    before = trainer.exposures.maps[scene.train[0].name].copy()
+    trainer.evaluate(scene.test)
+    steps(trainer, run, 3)
+    after = trainer.exposures.maps[scene.train[0].name]
+    trainer.evaluate(scene.test)
+    assert len(calls) == 2 and not np.array_equal(before, after)
 
 
 def test_exposures_are_those_beside_the_gaussians(trained):

@@ -158,6 +158,9 @@ def test_two_tiny_photographs(scene, tmp_path):
     trainer, run = stepped(few, tmp_path, 20)
     keep(trainer, run)
     trainer, run = begin(few, tmp_path, **SURFACE)
+    row, options = few.train[0].camera.resized(4, 1), replace(trainer.options, normals=True)
+    flat, _ = trainer._render(row, trainer.background, options)
+    assert trainer.parts[0].loss(torch.zeros(()), flat, Step(50, few.train[0])) == 0
     restore(trainer, run, load_checkpoint(tmp_path))
     assert run.iteration == 20 and not trainer.parts[0].kept.any()
     steps(trainer, run, 24)

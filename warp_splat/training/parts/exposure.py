@@ -45,6 +45,7 @@ class Exposure:
         device = setting.model.device
         self.maps = torch.zeros(len(self.places), *COLOR_MAPS[self.kind], device=device, requires_grad=True)
         self.falloff = torch.zeros(2, device=device, requires_grad=True)
+        self.found: Exposures | None = None  # since the last step
 
     @classmethod
     def needed(cls, scene: Scene) -> Verdict:
@@ -96,13 +97,16 @@ class Exposure:
         return {"exposure.json": {name: torch.cat([n[:3], n[3:].T], 1).tolist() for name, n in pairs}}
 
     def exposures(self) -> Exposures:
-        """Of all photographs; those of held-out ones are guessed from the nearest that train."""
+        """Of all photographs; those of held-out ones are guessed from the nearest that train, once after each step."""
+        if self.found:
+            return self.found
         maps, scene = self.maps.detach().cpu().numpy(), self.scene
         train, test = ([view.camera for view in views] for views in (scene.train, scene.test))
         found = [*maps, *guessed(maps, train, test, scene.extent).astype(np.float32)]
         names = [view.name for view in (*scene.train, *scene.test)]
         falloff = self.falloff.detach().cpu().numpy()
-        return Exposures(self.kind, self.pivot, falloff, dict(zip(names, found, strict=True)))
+        self.found = Exposures(self.kind, self.pivot, falloff, dict(zip(names, found, strict=True)))
+        return self.found
 
     @torch.no_grad()
     def after_step(self, iteration: int) -> None:
@@ -111,4 +115,5 @@ class Exposure:
         mean = units.sum(0).div(len(units), rounding_mode="floor")
         left = units.sum(0) - len(units) * mean  # fewer than there are photographs
         order = torch.arange(len(units), device=units.device).view(-1, *[1] * left.dim())
+        self.found = None
         self.maps.copy_((units - mean - (order < left).long()) * UNIT)

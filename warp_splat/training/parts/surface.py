@@ -78,7 +78,8 @@ class SurfacePart:
                 error = torch.where(seen, self._error(points, camera, other), 0.0)
                 added = added + self.options.surface_views / OTHERS * _mean(error)
             nearness = torch.where(seen, 1 / depth.detach(), 0.0)[None, None]
-            self.kept[place] = torch.nn.functional.interpolate(nearness, (SIZE, SIZE), mode="nearest-exact")[0, 0]
+            if nearness.numel():  # not of photographs of one row
+                self.kept[place] = torch.nn.functional.interpolate(nearness, (SIZE, SIZE), mode="nearest-exact")[0, 0]
             return loss + added.to(loss.dtype)
 
     def _error(self, points: torch.Tensor, camera: Camera, place: int) -> torch.Tensor:
