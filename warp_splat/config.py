@@ -288,4 +288,4 @@ class AuditConfig:
     case: str = flag("", "only this scene, made as small as still shows what is wrong with it")
     out: str = flag("output/audit", "folder for audit.json and audit.html, or for the files of --case", "-o")
     degree: int = flag(3, "of harmonics, the highest that the renderer claims", most=3)
-    limit: float = flag(60.0, "seconds for a picture, after which it counts as hanging")
+    limit: float = flag(60.0, "seconds for a picture, after which it counts as hanging", least=0.1)

@@ -90,6 +90,7 @@ FOREIGN_FLAGS = {
     "--convert_SHs_python": "colors are always computed by the kernels",
     "--compute_cov3D_python": "covariances are always computed by the kernels",
     "--ip": "the viewer (--viewer) is served to this machine only",
+    "--host": "the viewer is served to this machine only; from another, go through ssh -L",
     "--disable_viewer": "there is no viewer unless --viewer asks for it",
     "--debug": "there is no debug mode; set WARP_SPLAT_TRACEBACK=1 to see where an error arose",
     "--debug_from": "there is no debug mode; set WARP_SPLAT_TRACEBACK=1 to see where an error arose",

@@ -114,7 +114,7 @@ def merge_blocks(config: MergeConfig) -> int:
     folder = Path(config.folder)
     places = sorted(path.parent for path in folder.glob(f"*/{BLOCK}"))
     if (folder / LAST).exists() or not places:
-        found = "a training" if places else "none"
+        found = "a training" if places else "none" if folder.is_dir() else "no such folder"
         raise InputError(f"{folder}: expected only folders of ended trainings by --block, found {found}.")
     blocks = [read_json(place / BLOCK, "a block as training writes it", _block_of_json) for place in places]
     models = [open_model(place)[:2] for place in places]
