@@ -14,6 +14,7 @@ from types import SimpleNamespace
 import audit
 import audit_targets
 import numpy as np
+import psutil
 import pytest
 import torch
 import wrong_renderer
@@ -220,6 +221,16 @@ def shown_by(place):
     drawn, camera = SCENES["one"][1]()
     given = [drawn[name] for name in ("means", "quats", "scales", "opacities", "sh_dc")]
     return function_of(place)(*given, camera, torch.zeros(3))
+
+
+@pytest.mark.slow
+def test_what_hangs_ends_with_what_it_has_started(tmp_path):
+    (tmp_path / "hangs.sh").write_text(f"echo $$ > {tmp_path / 'number'}; exec sleep 600\n")
+    renderer = Renderer(f"sh {tmp_path / 'hangs.sh'} {{out}}", limit=5.0)
+    (row,) = measure(renderer, {}, scenes=("one",))
+    renderer.close()
+    started = [process for process in psutil.process_iter() if process.pid == int((tmp_path / "number").read_text())]
+    assert "hangs" in row.verdict and all(process.status() == psutil.STATUS_ZOMBIE for process in started)
 
 
 @pytest.mark.slow

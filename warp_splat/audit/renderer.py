@@ -3,6 +3,7 @@
 import importlib
 import multiprocessing
 import os
+import signal
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
@@ -90,6 +91,8 @@ class Renderer:
     def close(self) -> None:
         """End the process."""
         if self.process is not None:
+            with suppress(ProcessLookupError, AttributeError):  # what it has started, too
+                os.killpg(self.process.pid, signal.SIGKILL)
             self.process.kill()
             self.process.join()
             self.process = None
@@ -117,6 +120,8 @@ def function_of(place: str):
 
 def _serve(connection, place: str) -> None:
     """The loop of the process: Gaussians in, picture and gradients out, or a phrase that says what went wrong."""
+    with suppress(AttributeError):  # Windows has none
+        os.setsid()  # Ctrl-C is for the one that asks
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # what it prints is not the audit's to say
     try:
         render = function_of(place)
