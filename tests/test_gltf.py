@@ -1,6 +1,7 @@
 """Gaussians as glTF: what the extension says, nodes that place them, pieces, and what others write."""
 
 import copy
+import json
 from types import SimpleNamespace
 
 import numpy as np
@@ -40,6 +41,16 @@ def test_gltf_holds_what_the_extension_says(tmp_path, ending):
             name = f"{NAME}:SH_DEGREE_{degree}_COEF_{order}"
             np.testing.assert_array_equal(found[name], wanted.sh[:, degree * degree + order])
     assert (found["COLOR_0"][:, 3] == np.rint(255 * sigmoid(wanted.opacities))).all()
+
+
+@pytest.mark.parametrize("name", ["a%41b", "a#b c", "100%"])
+def test_gltf_of_any_name_finds_its_buffer(tmp_path, name):
+    save_gaussians(tmp_path / f"{name}.gltf", some_file(3), report=silent)
+    (buffer,) = json.loads((tmp_path / f"{name}.gltf").read_text())["buffers"]
+    assert (
+        not {"#", " "} & {*buffer["uri"]}
+        and len(load_gaussians(tmp_path / f"{name}.gltf", report=silent).splats.means) == 3
+    )
 
 
 def place(tmp_path, nodes, **more):

@@ -6,15 +6,19 @@ import re
 import numpy as np
 import pytest
 from common import picture_of
+from fake_viser import some_scene
 from pages import CAMERAS, EVIL, OPTIONS, Blocks, many_splats, unpacked
 from splat_files import covariances, some_splats
 
+from warp_splat.cli import main
 from warp_splat.evaluation.metrics import psnr
 from warp_splat.export_html import pack
 from warp_splat.export_html.command import make_page
 from warp_splat.export_html.merge import groups, importance, merged
 from warp_splat.export_html.pack import parts, shown
-from warp_splat.formats.splats import SplatArrays
+from warp_splat.formats.exchange import save_gaussians
+from warp_splat.formats.model_folder import ply_path, write_cameras
+from warp_splat.formats.splats import SplatArrays, SplatFile
 from warp_splat.gaussians import GaussianModel
 from warp_splat.rendering.camera_paths import ORBIT_LENS, orbit_cameras
 
@@ -71,6 +75,19 @@ def test_names_of_strangers_are_text():
     assert json.loads(page.found["scene"])["cameras"][0]["name"] == EVIL
     assert page.tags == Blocks(make_page("fine", some_splats(3), [("fine", cameras[0][1])], OPTIONS)).tags
     assert re.search(r"content=\"default-src 'none'; script-src 'sha256-[^' ]*'; ", text)
+
+
+def test_cameras_are_those_beside_the_gaussians(tmp_path, monkeypatch):
+    """Of a model whose cameras were refined until another iteration; else those of the folder."""
+    views, found = some_scene().train, []
+    for iteration in (5, 7):
+        save_gaussians(ply_path(tmp_path, iteration), SplatFile(some_splats(20)))
+    write_cameras(tmp_path, [], views)
+    write_cameras(ply_path(tmp_path, 5).parent, [], views[1:])
+    monkeypatch.setattr("warp_splat.export_html.command.make_page", lambda *given: found.append(given[2]) or "")
+    for model in (ply_path(tmp_path, 5), tmp_path):
+        assert main(["export-html", str(model), str(tmp_path / "page.html")]) == 0
+    assert [[name for name, _ in cameras] for cameras in found] == [[v.name for v in views[k:]] for k in (1, 0)]
 
 
 @pytest.mark.parametrize(("total", "count"), [(1, 1), (7, 7), (1000, 1), (1000, 37), (1000, 768)])

@@ -42,7 +42,8 @@ def export_html(config: ExportHtmlConfig) -> int:
     if (path := Path(config.page)).suffix.lower() not in (".html", ".htm"):
         raise InputError(f"{path}: expected the name of a page, which ends in .html; found {path.suffix!r}.")
     iteration, (splats, *_), trained = model_folder.open_model(config.model, crop=config.crop)
-    cameras = model_folder.read_cameras(model_folder.folder_of(config.model))
+    cameras = [*model_folder.read_refined(config.model, iteration).items()]
+    cameras = cameras or model_folder.read_cameras(model_folder.folder_of(config.model))
     kept = pack.shown(splats, config.max_gaussians)
     options = {
         "ANTIALIASED": bool(trained.get("antialiasing")),
