@@ -244,11 +244,10 @@ def _groups(root: Path, names: list[str], threads: int, say) -> tuple[list[list[
             say(f"warning: leaving out a photograph: {error}")
             return None
 
-    with ThreadPoolExecutor(threads) as pool:
-        lenses = list(pool.map(lens, names))
     groups: dict[Any, list[str]] = defaultdict(list)
-    for name, key in zip(names, lenses, strict=True):
-        groups[key].append(name)
+    with ThreadPoolExecutor(threads) as pool:
+        for name, key in zip(names, pool.map(lens, names), strict=True):
+            groups[key].append(name)
     broken = groups.pop(None, [])
     return list(groups.values()), broken
 

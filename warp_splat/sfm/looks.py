@@ -6,7 +6,7 @@ normalized residuals (Arandjelovic and Zisserman 2013). All is drawn from a seed
 
 from collections import defaultdict
 from collections.abc import Callable
-from itertools import pairwise
+from itertools import combinations, pairwise
 
 import numpy as np
 
@@ -93,11 +93,9 @@ def beyond(matched: dict[tuple[int, int], int], tried: set[tuple[int, int]]) -> 
         fits[a][b] = fits[b][a] = count
     score: dict[tuple[int, int], int] = defaultdict(int)
     for middle in sorted(fits):
-        others = sorted(fits[middle].items())
-        for place, (a, to_a) in enumerate(others):
-            for b, to_b in others[place + 1 :]:
-                if (a, b) not in tried:
-                    score[a, b] += min(to_a, to_b)
+        for (a, to_a), (b, to_b) in combinations(sorted(fits[middle].items()), 2):
+            if (a, b) not in tried:
+                score[a, b] += min(to_a, to_b)
     taken, room = [], dict.fromkeys(fits, NEAREST)
     for pair in sorted(score, key=lambda pair: (-score[pair], pair)):
         if score[pair] >= THROUGH and all(room[each] > 0 for each in pair):

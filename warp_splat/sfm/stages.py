@@ -110,16 +110,13 @@ def write_scene(model: Path, root: Path, scene: Path, part: Path, count: int, co
     """
     shutil.rmtree(part, ignore_errors=True)
     shutil.rmtree(scene / "images", ignore_errors=True)  # of a run that was stopped before sparse/ got its name
-    if config.keep_lens:
-        title, work = "copies", partial(_copy, part, model, root)
-    else:
-        work = partial(pycolmap.undistort_images, part, model, root, num_threads=config.threads)
-        title = "undistortion"
+    undistort = partial(pycolmap.undistort_images, num_threads=config.threads)
+    title, write = ("copies", _copy) if config.keep_lens else ("undistortion", undistort)
 
     def written() -> int:
         return sum(path.is_file() for path in (part / "images").rglob("*")) if part.is_dir() else 0
 
-    run_watched(scene, title, count, work, written, config.quiet)
+    run_watched(scene, title, count, partial(write, part, model, root), written, config.quiet)
     if written() < count:
         raise InputError(f"{part}: only {written()} of {count} images could be written; free some space and run again.")
     os.replace(part / "images", scene / "images")
