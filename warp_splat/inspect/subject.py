@@ -11,7 +11,7 @@ from PIL import Image
 
 from warp_splat.color import to_srgb
 from warp_splat.errors import InputError
-from warp_splat.scene import colmap, images, takes_colmap, transforms, with_masks
+from warp_splat.scene import TRAIN, colmap, images, takes_colmap, transforms, with_masks
 from warp_splat.scene.colmap_library import pycolmap
 from warp_splat.scene.images import Photo
 from warp_splat.scene.lenses import make_sampling
@@ -64,7 +64,7 @@ def read_subject(source: Path, folder: str) -> tuple[Subject, list[Finding]]:
         if of_colmap:
             findings += _read_colmap(subject)
         else:
-            subject.random_points = (source / transforms.TRAIN).is_file()
+            subject.random_points = (source / TRAIN).is_file()
             train, test, points, _ = transforms.read_transforms(source, lambda line: None)
             subject.points, subject.photos = points.astype(np.float64), train + test
     except InputError as error:

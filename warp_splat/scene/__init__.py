@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Scene", "View", "has_cameras", "load_scene"]
 
+TRAIN, ALL = "transforms_train.json", "transforms.json"  # cameras of nerf-synthetic; of nerfstudio and instant-ngp
 MASKS = "masks"  # the folder beside the images' or, for cameras in JSON, in the scene
 ROUNDED = 1e-4  # of the distance between cameras, which may be lost by rounding
 HOLD_OUT = 8  # every 8th image by name is for testing (graphdeco `llffhold`, after Barron et al. 2022)
@@ -165,10 +166,10 @@ def read_photos(
     if takes_colmap(source):
         photos, points, colors = colmap.read_colmap(source, folder, report, native)
         return with_masks(photos, source, report), [], points, colors
-    if transforms.has_transforms(source):
+    if has_transforms(source):
         train, test, points, colors = transforms.read_transforms(source, report, native)
         return with_masks(train, source, report), with_masks(test, source, report), points, colors
-    expected = f"expected a scene with cameras, a COLMAP model (sparse/), {transforms.TRAIN} or {transforms.ALL}"
+    expected = f"expected a scene with cameras, a COLMAP model (sparse/), {TRAIN} or {ALL}"
     if (source / "point_cloud").is_dir():
         raise InputError(f"{source}: {expected}, found a trained model; give the folder of its scene.")
     if photographs := find_files(photo_root(source), PHOTOS):
@@ -180,15 +181,17 @@ def read_photos(
 
 def has_cameras(source: str | Path) -> bool:
     """Whether ``source`` looks like a scene that :func:`load_scene` reads, not like photographs alone."""
-    from warp_splat.scene import transforms  # noqa: PLC0415  keeps `import warp_splat` light
+    return (Path(source) / "sparse").is_dir() or has_transforms(Path(source))
 
-    return (Path(source) / "sparse").is_dir() or transforms.has_transforms(Path(source))
+
+def has_transforms(source: Path) -> bool:
+    """Whether the folder holds a file of cameras in JSON."""
+    return any((source / name).is_file() for name in (TRAIN, ALL))
 
 
 def takes_colmap(source: Path) -> bool:
     """Whether the cameras are read from sparse/: where pycolmap is missing, a transforms.json beside it comes first."""
     from warp_splat.scene.colmap_library import pycolmap  # noqa: PLC0415  keeps `import warp_splat` light
-    from warp_splat.scene.transforms import has_transforms  # noqa: PLC0415
 
     return (source / "sparse").is_dir() and (pycolmap is not None or not has_transforms(source))
 

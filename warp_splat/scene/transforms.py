@@ -15,14 +15,13 @@ import numpy as np
 from warp_splat.errors import InputError, refusing
 from warp_splat.formats.files import reading
 from warp_splat.formats.ply import GRAY, load_points
-from warp_splat.scene import images
+from warp_splat.scene import ALL, TRAIN, images
 from warp_splat.scene.images import Photo
 from warp_splat.scene.lenses import Calibration, Sampling, make_photo, make_sampling, tell_lenses
 from warp_splat.scene.photos import ImageFinder
 from warp_splat.text import Report, few
 
-TRAIN, TEST = "transforms_train.json", "transforms_test.json"  # nerf-synthetic
-ALL = "transforms.json"  # nerfstudio, instant-ngp
+TEST = "transforms_test.json"  # beside TRAIN
 POINTS, HALF_WIDTH = 100_000, 1.3  # graphdeco, scene/dataset_readers.py: "inside the bounds of the synthetic scenes"
 TOLERANCE = 1e-3  # of a pose's axes, for files that round their numbers
 JSON_BYTES = 2**24  # of 20,000 frames; no JSON of this size takes more than a gigabyte once parsed
@@ -31,11 +30,6 @@ PERSPECTIVE = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV",
 FISHEYE, PANORAMA = "OPENCV_FISHEYE", "EQUIRECTANGULAR"
 UNKNOWN = ("latlong", "ftheta_p0")  # lenses of instant-ngp
 FOCAL = {"fl_x", "fl_y", "camera_angle_x", "camera_angle_y"}  # a frame that has one of them takes none of the file's
-
-
-def has_transforms(source: Path) -> bool:
-    """Whether the folder holds a file of cameras that :func:`read` knows."""
-    return any((source / name).is_file() for name in (TRAIN, ALL))
 
 
 def read_transforms(
