@@ -32,9 +32,8 @@ def _sky(camera: Camera, points: np.ndarray, up: np.ndarray) -> np.ndarray:
     shown = points[visible(camera, points)] @ camera.rotation.T + camera.translation
     column, row = np.minimum(camera.pixels(shown) / longest * CELLS, (columns - 1, rows - 1)).astype(np.int64).T
     free = np.ones((rows + 2, columns + 2), bool)
-    for down in range(3):
-        for right in range(3):
-            free[row + down, column + right] = False
+    for down, right in np.ndindex(3, 3):
+        free[row + down, column + right] = False
     x, y = (np.arange(columns) + 0.5) * longest / CELLS, (np.arange(rows) + 0.5) * longest / CELLS
     rays = camera.rays(np.stack(np.broadcast_arrays(x, y[:, None]), -1).reshape(-1, 2)) @ camera.rotation
     sky = free[1:-1, 1:-1] & (rays @ up > 0).reshape(rows, columns)  # not, where a lens sees nothing

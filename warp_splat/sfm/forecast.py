@@ -67,5 +67,4 @@ def _measured(root: Path, tried: list[list[str]], config: SfmConfig) -> tuple[fl
         with pycolmap.Database.open(str(database)) as connection:
             count, features = sum(map(len, tried)), connection.num_keypoints()
         match_pairs(database, pairs, len(pairs), config)
-        extraction, matching = extracted - began, time.process_time() - extracted
-    return extraction / count, features / count, matching / len(pairs)
+        return (extracted - began) / count, features / count, (time.process_time() - extracted) / len(pairs)
