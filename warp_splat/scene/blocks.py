@@ -129,20 +129,19 @@ def merge_blocks(config: MergeConfig) -> int:
     if wrong := [f"{numbers.count(n)} of block {n + 1}/{count}" for n in range(count) if numbers.count(n) != 1]:
         raise InputError(f"{folder}: expected one ended training of each block, found {', '.join(wrong)}.")
     path = ply_path(folder, max(iteration for iteration, _ in models))
-    splats, points, colors, cameras = [], [], [], {}
+    splats, clouds, cameras = [], [], {}
     for place, block, (_, file) in zip(places, blocks, models, strict=True):
         splats.append(file.splats.take(block.holds(file.splats.means)))
         cloud = load_points(place / "input.ply")
         own = block.holds(cloud[0])
-        points.append(cloud[0][own])
-        colors.append(cloud[1][own])
+        clouds.append([column[own] for column in cloud])
         named = lambda entries: {str(entry["img_name"]): entry for entry in entries}  # noqa: E731
         cameras |= read_json(place / CAMERAS, "cameras as training writes them", named)
     merged = models[0][1]._replace(splats=arranged(concatenated(splats)), linear=False)  # cfg_args says it
     save_gaussians(path, merged)
     for old in {*folder.glob("point_cloud/*/point_cloud.ply")} - {path}:  # merged before, from blocks of other lengths
         old.unlink()
-    save_points(folder / "input.ply", np.concatenate(points), np.concatenate(colors))
+    save_points(folder / "input.ply", *map(np.concatenate, zip(*clouds, strict=True)))
     write_json(folder / CAMERAS, [{**cameras[name], "id": index} for index, name in enumerate(sorted(cameras))])
     write_coordinates(folder, read_coordinates(places[0]))
     write_cfg_args(folder, {**trained[0], "block": "", "model_path": str(folder)})
