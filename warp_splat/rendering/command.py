@@ -96,7 +96,9 @@ def render_model(config: RenderConfig) -> int:
     _check(config)
     metrics, absent = choose_metrics(config.lpips_weights)
     device = settle_device(config.device, config.threads, say=say)
-    folder, finished = _open(config)
+    path = Path(config.model_path)
+    folder = Path(f"{path}.renders") if model_folder.is_file_of_gaussians(path) else path  # of a file, beside it
+    finished = Finished(path, config.iteration)
     model, iteration = GaussianModel.from_splats(finished.file.splats).arranged(), finished.iteration
     if (config.orbit or config.video) and not len(model):
         raise InputError(f"{config.model_path}: expected a Gaussian to film, found none; name another model.")
@@ -139,7 +141,7 @@ def render_model(config: RenderConfig) -> int:
                 certify(train, written)
             if test:
                 extra = {"split": "test", "gaussians": len(model)}
-                seen = model.activated(), finished.background(device), options, given.extent
+                seen = activated, finished.background(device), options, given.extent
                 where = where_taken(*seen) if scene is not given else None
                 means, compared = evaluate_views(picture, test, folder, "test", iteration, extra, metrics, where)
                 show_views(compared, folder, "test", iteration, say)
@@ -175,6 +177,8 @@ def _check(config: RenderConfig) -> None:
         raise InputError(f"--orbit_center {config.orbit_center}: expected --orbit or --video orbit beside it.")
     if (suffix := Path(config.video_output).suffix.lower()) in OTHER_VIDEOS:
         raise InputError(f"--video_output {config.video_output}: expected .mp4 or a folder, found {suffix}; rename it.")
+    if not config.model_path:
+        raise InputError("-m: expected the folder of a trained model; train.py prints it at its end.")
 
 
 def _memory_explained(device: torch.device, model: GaussianModel, scene: Scene | None):
@@ -184,18 +188,6 @@ def _memory_explained(device: torch.device, model: GaussianModel, scene: Scene |
     fewer = ["trained with fewer Gaussians (--max_gaussians)", *(["on smaller images (-r)"] if scene else [])]
     elsewhere = ", or use --device cpu" if device.type == "cuda" else ""
     return memory_explained(device, model, sizes, f"render a model {' or '.join(fewer)}{elsewhere}")
-
-
-def _open(config: RenderConfig) -> tuple[Path, Finished]:
-    """The folder for the images, and the model.
-
-    The images of a file of Gaussians go beside it.
-    """
-    if not config.model_path:
-        raise InputError("-m: expected the folder of a trained model; train.py prints it at its end.")
-    path = Path(config.model_path)
-    folder = Path(f"{path}.renders") if model_folder.is_file_of_gaussians(path) else path
-    return folder, Finished(path, config.iteration)
 
 
 def _cameras(config: RenderConfig, scene: Scene | None) -> list[Camera]:
