@@ -12,7 +12,7 @@ from warp_splat.errors import InputError
 from warp_splat.inspect.subject import Finding, Subject
 from warp_splat.scene import gains as brightness
 from warp_splat.scene import horizon
-from warp_splat.scene.images import Photo, read_exposure
+from warp_splat.scene.images import read_exposure
 from warp_splat.scene.types import visible
 from warp_splat.text import few
 
@@ -196,9 +196,3 @@ TURNS = {
 
 #: In an order in which later ones may use what earlier ones measured.
 CHECKS = (check_reprojection, check_coverage, check_sky, check_axes, check_exposure)
-
-
-def worst_and_best(subject: Subject, photos: list[Photo], count: int) -> list[Photo]:
-    """Photos to look at: the worst half by reprojection error, the rest evenly from the others."""
-    ranked = sorted(photos, key=lambda photo: -subject.medians.get(photo.name, 0.0))
-    return ranked[: count // 2] + sample(ranked[count // 2 :], count - count // 2)

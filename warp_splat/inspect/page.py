@@ -15,12 +15,13 @@ from matplotlib.figure import Figure
 
 from warp_splat.evaluation.report import BLUE, INK, ORANGE, TALLEST, WIDTH, new_figure, new_panels, plain_axes
 from warp_splat.formats.files import write_text
-from warp_splat.inspect.geometry import sample, worst_and_best
+from warp_splat.inspect.geometry import sample
 from warp_splat.inspect.subject import THUMBNAIL, Finding, Subject
+from warp_splat.scene.images import Photo
 from warp_splat.scene.types import visible
 
 SHEET, COLUMNS = 60, 10  # thumbnails, at most, and in a row
-ON_PHOTOS = 6
+WORST = 3  # photographs with points on them, and as many others
 DOTS = 1500  # points drawn on a photograph
 MOST = 3.0  # px; larger errors have the same color
 MAPPED = 5000  # points drawn on the map
@@ -58,7 +59,7 @@ def draw_pictures(subject: Subject) -> Iterable[tuple[str, str]]:
     caption = "Points projected into photographs: they should lie on what is there"
     if subject.errors:
         caption = "Where points were seen, colored by how far from there they project (the worst images first)"
-    yield caption, _encode(_on_photos(subject))
+    yield caption, _encode(_on_photos(subject, shown))
     yield "Cameras (with their viewing directions) and points, from two sides", _encode(_map(subject))
     if subject.errors:
         yield "Reprojection error and points of each image, by name", _encode(_bars(subject))
@@ -93,8 +94,10 @@ def _sheet(subject: Subject, names: list[str]) -> Figure:
     return figure
 
 
-def _on_photos(subject: Subject) -> Figure:
-    photos = worst_and_best(subject, [p for p in subject.photos if p.name in subject.thumbnails], ON_PHOTOS)
+def _on_photos(subject: Subject, shown: list[Photo]) -> Figure:
+    """The worst photographs by reprojection error, as many evenly from the others."""
+    ranked = sorted(shown, key=lambda photo: -subject.medians.get(photo.name, 0.0))
+    photos = ranked[:WORST] + sample(ranked[WORST:], WORST)
     height, width = subject.thumbnails[photos[0].name].shape[:2]
     columns, dots = 3 if height > width else 2, None
     rows = math.ceil(len(photos) / columns)
