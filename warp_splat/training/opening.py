@@ -73,9 +73,8 @@ def resolve(config: TrainConfig, processes: Processes) -> tuple[TrainConfig, Che
     if data.sfm:
         from warp_splat.sfm.command import scene_for  # noqa: PLC0415 - only photographs without cameras need it
 
-        options = {"threads": machine.threads, "seed": config.learn.seed % 2**31, "quiet": quiet}
-        options["keep_lens"] = data.lens == "native"
-        source = scene_for(source, processes.count, **options)
+        options = {"seed": config.learn.seed % 2**31, "keep_lens": data.lens == "native"}
+        source = scene_for(source, processes.count, threads=machine.threads, quiet=quiet, **options)
     more = -(iterations - done) % processes.images  # whole steps
     if more and not config.learn.minutes:
         say(f"A step trains on {processes.images} images: --iterations {iterations} ends after {iterations + more}.")

@@ -52,8 +52,7 @@ class Cost(NamedTuple):
 
         rows = np.array([(1.0, m.gaussians, m.pixels, m.seconds) for m in measured], dtype=np.float64)
         size = rows[:, :3].max(0)  # so that the columns are of one order
-        weighted = rows / rows[:, 3:]
-        found = nnls(weighted[:, :3] / size, np.ones(len(rows)))[0] / size
+        found = nnls(rows[:, :3] / rows[:, 3:] / size, np.ones(len(rows)))[0] / size
         return cls(*found.tolist())
 
 

@@ -125,9 +125,8 @@ def quality(config: TrainConfig, scene: Scene, parts: list[str], steps: int, fol
     """CC_PSNR [dB] and SSIM of photographs held back from a training with these parts, over so many steps."""
     held = scene.train[fold::PERIOD]
     kept = [view for place, view in enumerate(scene.train) if place % PERIOD != fold]
-    part = replace(scene, train=kept, test=held, find_tracks=lambda: scene.tracks)
     short = _shortened(config, scene, steps).changed(parts=",".join(parts), seed=config.learn.seed ^ fold)
-    trainer = Trainer(part, short)
+    trainer = Trainer(replace(scene, train=kept, test=held, find_tracks=lambda: scene.tracks), short)
     for iteration in range(1, steps + 1):
         trainer.advance(iteration)
     values = []

@@ -99,9 +99,8 @@ class Reference:
         self.random.set_state(torch.from_numpy(checkpoint.generator("random.densification")))
 
     def _densify(self, prune_large: bool) -> Change:
-        self.processes.merge(self.gradient)
-        self.processes.merge(self.views)
-        self.processes.merge(self.radius, largest=True)
+        for name, rows in self.statistics().items():
+            self.processes.merge(rows, largest=name == "radius")
         raw = {name: tensor.detach() for name, tensor in self.model.parameters.items()}
         chosen = self._choose()
         splits = raw["scales"].amax(1) > _log(self.options.percent_dense * self.extent)

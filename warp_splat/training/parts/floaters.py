@@ -26,7 +26,6 @@ class Floaters:
 
     def price(self, gaussians: Gaussians) -> torch.Tensor:
         """The term; its gradient is the weight / N for each opacity."""
-        opacities = gaussians.opacities.nan_to_num()
         # Now multiples of 2^-23: in float64 their sum is exact, and the same in any order.
-        total = (opacities + 1.0 - 1.0).double().sum()
+        total = (gaussians.opacities.nan_to_num() + 1.0 - 1.0).double().sum()
         return self.weight * (total / max(self.processes.total(len(self.model)), 1))
