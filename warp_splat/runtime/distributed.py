@@ -90,9 +90,7 @@ class Processes:
 
     def largest(self, value: int) -> int:
         """The largest ``value`` of all processes."""
-        found = torch.tensor([value], dtype=torch.int32)
-        self._exchange(dist.all_reduce, found, dist.ReduceOp.MAX)
-        return int(found)
+        return int(self.gather(torch.tensor([value])).max())
 
     def gather(self, tensor: torch.Tensor) -> torch.Tensor:
         """The tensors of all processes, stacked: [count, ...]."""

@@ -39,9 +39,7 @@ class Shards(Processes):
 
     def total(self, count: int) -> int:
         """The sum over the processes."""
-        found = torch.tensor([count])
-        self.sum(found)
-        return int(found)
+        return int(self.gather(torch.tensor([count])).sum())
 
     def merge(self, tensor: torch.Tensor, largest: bool = False) -> None:
         """Nothing: of its own Gaussians, a process has seen all views."""

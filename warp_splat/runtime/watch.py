@@ -29,9 +29,8 @@ class Watch:
 
     def gone(self, seconds: float) -> list[int]:
         """Other processes that have left no sign for so long."""
-        named = enumerate(zip(self.signs, self.changed, strict=True))
-        silent = [rank for rank, (sign, then) in named if self.seconds - then > seconds and sign != LEFT.encode()]
-        return [rank for rank in silent if rank != self.rank]
+        silent = [rank for rank, then in enumerate(self.changed) if self.seconds - then > seconds]
+        return [rank for rank in silent if rank != self.rank and self.signs[rank] != LEFT.encode()]
 
     def silent(self) -> list[int]:
         """Those that have gone by now, which takes a moment to tell."""
