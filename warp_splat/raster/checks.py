@@ -71,26 +71,26 @@ def check_options(adjoint: str, options: RasterOptions | None) -> RasterOptions:
     options = RasterOptions() if options is None else options
     if not isinstance(options, RasterOptions):
         raise InputError(f"options: expected a warp_splat.RasterOptions, got {type(options).__name__}.")
+    given = vars(options)
     if not is_one_of(options.sh_degree, (None, 0, 1, 2, 3)):
         raise InputError(f"options.sh_degree: expected 0, 1, 2, 3 or None, got {options.sh_degree!r}.")
     if not isinstance(options.projection, Projection) and not is_one_of(options.projection, config.PROJECTIONS):
         wanted = f"one of {', '.join(config.PROJECTIONS)} or a warp_splat.kernels.project.Projection"
         raise InputError(f"options.projection: expected {wanted}, got {options.projection!r}.")
     for name, choices in (("extent", config.EXTENTS), ("exp_degree", config.EXP_DEGREES), ("of", config.BOUNDS_OF)):
-        if not is_one_of(getattr(options, name), choices):
+        if not is_one_of(given[name], choices):
             wanted = ", ".join(str(choice) for choice in choices)
-            raise InputError(f"options.{name}: expected one of {wanted}, got {getattr(options, name)!r}.")
+            raise InputError(f"options.{name}: expected one of {wanted}, got {given[name]!r}.")
     if not (options.falloff is None or isinstance(options.falloff, Falloff)):
         raise InputError(f"options.falloff: expected a warp_splat.Falloff or None, got {options.falloff!r:.80}.")
     for name in ("depth", "antialiasing", "median_depth", "normals", "bound"):
-        if not isinstance(getattr(options, name), bool):
-            raise InputError(f"options.{name}: expected True or False, got {getattr(options, name)!r}.")
+        if not isinstance(given[name], bool):
+            raise InputError(f"options.{name}: expected True or False, got {given[name]!r}.")
     for name in ("alpha_min", "t_min"):
-        value = getattr(options, name)
-        if not (isinstance(value, numbers.Real) and 0.0 <= float(value) < 1.0):
-            raise InputError(f"options.{name}: expected a number from 0 to below 1, got {value!r}.")
+        if not (isinstance(given[name], numbers.Real) and 0.0 <= float(given[name]) < 1.0):
+            raise InputError(f"options.{name}: expected a number from 0 to below 1, got {given[name]!r}.")
     for name, low, high in (("alpha_max", 0.0, 0.9999), ("near", 1e-6, 1e6), ("blur", 1e-6, 1e6)):
-        value = getattr(options, name)
+        value = given[name]
         if isinstance(value, bool) or not (isinstance(value, numbers.Real) and low <= float(value) <= high):
             raise InputError(f"options.{name}: expected a number from {low:g} to {high:g}, got {value!r:.60}.")
     steps = options.max_steps
@@ -101,8 +101,7 @@ def check_options(adjoint: str, options: RasterOptions | None) -> RasterOptions:
         raise InputError(f"options.strongest: expected a whole number, 0 to {config.STRONGEST_MOST}, got {most!r}.")
     whole, kinds = ("strongest", "sh_degree", "exp_degree", "max_steps"), {}
     kinds |= dict.fromkeys(whole, int) | dict.fromkeys(("alpha_min", "alpha_max", "t_min", "near", "blur"), float)
-    given = {name: getattr(options, name) for name in kinds}
-    return replace(options, **{name: kinds[name](value) for name, value in given.items() if value is not None})
+    return replace(options, **{name: kind(given[name]) for name, kind in kinds.items() if given[name] is not None})
 
 
 def check_hidden_from(options: RasterOptions, camera: Camera, device: torch.device) -> None:
