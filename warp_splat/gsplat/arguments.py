@@ -72,9 +72,8 @@ def check_request(request: Request) -> Request:
         "backgrounds": (cameras, colors.shape[-1]),
         **{name: (cameras, counts.get(request.camera_model, 0)) for name, counts in COEFFICIENTS.items()},
     }
-    flat: dict[str, Any] = {}
-    if request.render_mode in ("D", "ED"):
-        flat["backgrounds"] = None  # they are of the colors
+    # backgrounds are of the colors
+    flat: dict[str, Any] = {"backgrounds": None} if request.render_mode in ("D", "ED") else {}
     for name, shape in shapes.items():
         if name not in flat and (given[name] is not None or name not in OPTIONAL):
             _check_tensor(name, given[name], (*batch, *shape), means.device)

@@ -154,7 +154,6 @@ def _tell(request: Request, seen: Seen, lists: list[Bins]) -> dict[str, Any]:
     """What else gsplat tells, by its names."""
     scenes, cameras, count = seen.drawn.shape
     tiles_x, tiles_y = -(-request.width // TILE), -(-request.height // TILE)
-    shape = (*request.batch, cameras)
     ids: dict[str, Any] = {"batch_ids": None, "camera_ids": None, "gaussian_ids": None}
     numbers = torch.arange(scenes * cameras * count, device=seen.drawn.device)
     if request.packed:
@@ -174,7 +173,7 @@ def _tell(request: Request, seen: Seen, lists: list[Bins]) -> dict[str, Any]:
         "tiles_per_gauss": _placed(request, seen, per_gaussian.view(seen.drawn.shape)),
         "isect_ids": (keys << 32) | seen.depths.detach().flatten()[gaussians].view(torch.int32).long(),
         "flatten_ids": numbers[gaussians].int(),
-        "isect_offsets": (sizes.cumsum(0) - sizes).int().view(*shape, tiles_y, tiles_x),
+        "isect_offsets": (sizes.cumsum(0) - sizes).int().view(*request.batch, cameras, tiles_y, tiles_x),
         "width": request.width,
         "height": request.height,
         "tile_size": TILE,

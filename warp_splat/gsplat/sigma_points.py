@@ -104,9 +104,8 @@ def see_points(request: Request, axes: torch.Tensor) -> tuple[torch.Tensor, ...]
     weight = 1 / (6 * ALPHA**2)
     moved = weight * off.sum(-2)
     (x, y), (mx, my) = off.unbind(-1), moved.unbind(-1)
-    rest = BETA - ALPHA**2
     pairs = (x, x, mx, mx), (x, y, mx, my), (y, y, my, my)
-    xx, xy, yy = (weight * (a * b).sum(-1) + rest * c * d for a, b, c, d in pairs)
+    xx, xy, yy = (weight * (a * b).sum(-1) + (BETA - ALPHA**2) * c * d for a, b, c, d in pairs)
     found = (places[..., 0, :] + moved, xx, xy, yy, (xx * yy - xy * xy).clamp_min(0.0))
     return *(part.to(request.means.dtype) for part in found), seen.any(-1)
 
