@@ -111,8 +111,7 @@ class Number(np.lib.mixins.NDArrayOperatorsMixin):
         if function is not np.where:
             raise NotImplementedError(f"{function}: no rule for it; see warp_splat/kernels/formula.py")
         mask, a, b = _aligned(self.notes, operands)
-        slopes = (self.notes.chosen(mask.name, *pair) for pair in zip(a.slopes, b.slopes, strict=True))
-        return Number(self.notes, self.notes.chosen(mask.name, a.name, b.name), tuple(slopes))
+        return _linear(lambda notes, *pair: notes.chosen(mask.name, *pair), self.notes, a, b)
 
 
 def _aligned(notes: Notes, operands: Sequence) -> list[Number]:
@@ -198,8 +197,7 @@ def write_function(
     names = [notes.real(result.name) for result in results]
     body = [*notes.lines(names, parameters[-1]), f"return {', '.join(names)}"]
     taken = ["camera: CameraView", *(f"{parameter}: number" for parameter in parameters), *more]
-    head = f"def {name}({', '.join(taken)}):"
-    source = "\n    ".join([head, *body]) + "\n"
+    source = "\n    ".join([f"def {name}({', '.join(taken)}):", *body]) + "\n"
     known = {**vars(simd), "angle": angle, "CameraView": CameraView, "of_lens": of_lens, "turn": turn}
     known["number"] = simd.TYPES[lanes].number
     return wp.func(defined(name, f"{source}# of {lanes}\n", known))

@@ -109,8 +109,7 @@ class _Assembly:
                 self.names[renamed.get(name, name)] = known[name]
         for node in nodes:
             node.id = given[node.id] if node.id in given else renamed.get(node.id, node.id)
-        is_text = lambda line: isinstance(line, ast.Expr) and isinstance(line.value, ast.Constant)  # noqa: E731
-        body = [line for line in definition.body if not is_text(line)]
+        body = definition.body[1:] if ast.get_docstring(definition) else definition.body
         name = f"{part} {function.__name__}"
         returns = [node for node in ast.walk(definition) if isinstance(node, ast.Return)]
         if returns != ([body[-1]] if target else []) or own & set(given):

@@ -8,8 +8,6 @@ A panorama ends where it begins. A Gaussian near a pole is as wide as the pictur
 copies, a turn to either side (:mod:`warp_splat.raster.seam`), add up to almost the same at all longitudes.
 """
 
-from collections.abc import Sequence
-
 import numpy as np
 import warp as wp
 
@@ -94,5 +92,4 @@ def make_narrow(lanes: int) -> wp.Function:
     wider = most * most < square
     shrunk = np.where(wider, most / np.sqrt(np.where(wider, square, 1.0)), 1.0)
     given |= {f"a1{axis}": shrunk * a for axis, a in enumerate(row)}
-    results: Sequence = [given[name] for name in OUTLINE[1:9]]
-    return write_function("narrow", notes, OUTLINE, [*results, given["drawn"]], lanes)
+    return write_function("narrow", notes, OUTLINE, [given[name] for name in (*OUTLINE[1:9], "drawn")], lanes)
