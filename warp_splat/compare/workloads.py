@@ -64,10 +64,9 @@ def layered(candidates: int) -> Workload:
     Opacities fall with their number, but not below what the cut at 1/255 leaves: at 10,000 most pixels stop early.
     """
     rng = np.random.default_rng(candidates)
-    size = LAYERED_SIZE
-    camera = make_camera(size, size, size, seed=None)
+    camera = make_camera(LAYERED_SIZE, LAYERED_SIZE, LAYERED_SIZE, seed=None)
     depth = distinct_depths(rng, candidates, 2.0, 8.0)
-    means = at_pixels(rng.uniform(0.3, 0.7, (candidates, 2)) * size, depth, camera)
+    means = at_pixels(rng.uniform(0.3, 0.7, (candidates, 2)) * LAYERED_SIZE, depth, camera)
     scales = rng.uniform(0.4, 0.9, (candidates, 3)) * depth[:, None]
     opacities = rng.uniform(0.0045, max(0.008, min(0.9, 15 / candidates)), candidates)
     arrays = (means, rng.normal(size=(candidates, 4)), scales, opacities, rng.uniform(-1.5, 1.5, (candidates, 1, 3)))

@@ -220,8 +220,7 @@ def motion_gradient(turns: list[torch.Tensor], lanes: int, wanted: bool) -> np.n
         return np.zeros((2, 4))
     parts = torch.cat(turns).view(-1, 3, lanes, 4)[:, 1:].nan_to_num(0.0, 0.0, 0.0)
     while parts.shape[2] > 1:
-        half = parts.shape[2] // 2
-        parts = parts[:, :, :half] + parts[:, :, half:]
+        parts = torch.add(*parts.chunk(2, 2))
     return in_pairs(parts.reshape(-1, 8)).cpu().numpy().reshape(2, 4)
 
 
