@@ -41,9 +41,7 @@ def kernel_of_parts(module_options: dict, **parts: Part) -> Callable:
 
     def decorate(function: Callable) -> wp.Kernel:
         definition, names = _parsed(function)
-        nodes = [node for node in ast.walk(definition) if isinstance(node, ast.Name)]
-        taken = {node.id for node in nodes if isinstance(node.ctx, ast.Store)}
-        taken |= {parameter.arg for parameter in definition.args.args}
+        taken = set(function.__code__.co_varnames)
         assembly = _Assembly(parts, names, taken, dict(function.__annotations__))
         definition.decorator_list = []
         definition.body = assembly.expanded(definition.body)
