@@ -111,9 +111,8 @@ def rasterize(
         with stage("tape"):
             leaves = {name: wp.to_torch(array, requires_grad=False) for name, array in named.items()}
             if recorded:  # the adjoint reads them, and simulators reuse their arrays
-                leaves = {name: leaf.clone() for name, leaf in leaves.items()}
-            for name, leaf in leaves.items():
-                leaf.requires_grad_(recorded and named[name].requires_grad)
+                for name, array in named.items():
+                    leaves[name] = leaves[name].clone().requires_grad_(array.requires_grad)
         found = _render(leaves, named, camera, background, adjoint, options)
         shown = {name: tensor for name in PIXELS if (tensor := getattr(found, name)) is not None}
         rooms = {} if out is None else out if isinstance(out, Mapping) else {type(out).__name__: out}

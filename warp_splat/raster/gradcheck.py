@@ -191,7 +191,6 @@ def _check(adjoint, options, camera, parameters, directions, tolerance, seed) ->
         raise InputError(f"tolerance: expected a number between 0 and 1, got {tolerance!r}.")
     if isinstance(seed, bool) or not (isinstance(seed, Integral) and 0 <= int(seed) < 2**63):
         raise InputError(f"seed: expected a whole number from 0 to below 2^63, got {seed!r}.")
-    checks.check_camera(camera)
     options = checks.check_options(ADJOINTS[0], options)
     if options.falloff and not {"conics", "opacities2d"}.isdisjoint(parameters or ()):
         raise InputError(

@@ -110,17 +110,16 @@ def launch(
         device: of the tensors behind ``inputs`` and ``outputs``.
         adjoint: ``adj_inputs`` and ``adj_outputs`` to run the generated adjoint instead.
     """
-    on_gpu, bounds = torch.device(device).type == "cuda", bounds or even_slices(dim)
     if dim == 0:
         return
     if adjoint:
         adjoint = {"adjoint": True, "adj_inputs": [None, *adjoint["adj_inputs"]], "adj_outputs": adjoint["adj_outputs"]}
-    if on_gpu:
+    if torch.device(device).type == "cuda":
         wp.launch(kernel, dim, [0, *inputs], outputs, stream=_stream(device), record_tape=False, **adjoint)
         return
 
     load("cpu", kernel)
-    in_slices(_bound(kernel, [0, *inputs], outputs, adjoint), bounds)
+    in_slices(_bound(kernel, [0, *inputs], outputs, adjoint), bounds or even_slices(dim))
 
 
 #: By kernel, and whether its adjoint: its module, which stays loaded; a function; tables of what that is given.
