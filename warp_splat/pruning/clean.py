@@ -18,7 +18,7 @@ from warp_splat.errors import InputError
 from warp_splat.evaluation.metrics import psnr
 from warp_splat.evaluation.report import contact_sheet
 from warp_splat.formats.splats import SplatArrays
-from warp_splat.pruning.opened import Opened, output_of, print_quality, write
+from warp_splat.pruning.opened import Opened, output_of, write
 from warp_splat.pruning.score import ViewSetting, weights
 from warp_splat.pruning.thinning import model_of, tuned
 
@@ -43,7 +43,7 @@ def clean(config: CleanConfig) -> int:
         left = file._replace(splats=splats)
         splats = tuned(opened.scene, left, opened.setting, len(splats.means), config.steps, trained)
     code = write(output, opened, splats)
-    print_quality(opened.quality(before), opened.quality(splats))
+    opened.print_quality(before, splats)
     sheet = output.with_suffix(".sheet.png")
     _draw(opened, before, splats, sheet)
     print(f"  the views that changed most, before and after: {sheet}")

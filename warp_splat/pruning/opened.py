@@ -75,10 +75,12 @@ class Opened(Finished):
         picture = self.picture_of(splats)
         return float(np.mean([psnr(picture(view.camera, view.name), view.picture, view.mask) for view in views]))
 
-    def quality(self, splats: SplatArrays) -> dict[str, float]:
-        """PSNR [dB] of the training views and, if there are any, of those held out."""
-        views = {"train": self.scene.train, "test": self.scene.test}
-        return {name: self.psnr(splats, some) for name, some in views.items() if some}
+    def print_quality(self, before: SplatArrays, after: SplatArrays) -> None:
+        """A line for the training views and, if there are any, for those held out."""
+        for name, views in {"train": self.scene.train, "test": self.scene.test}.items():
+            if views:
+                old, new = (self.psnr(splats, views) for splats in (before, after))
+                print(f"  {name} PSNR {old:.2f} -> {new:.2f} dB ({new - old:+.2f})")
 
 
 def within_sight(views: list[View], shows: Callable[[Camera], torch.Tensor]) -> list[View]:
@@ -131,9 +133,3 @@ def write(path: Path, finished: Finished, splats: SplatArrays) -> int:
     if notes:
         print(f"  lost: {'; '.join(dict.fromkeys(notes))}")
     return int(saved != path)
-
-
-def print_quality(before: dict[str, float], after: dict[str, float]) -> None:
-    """A line for each set of views."""
-    for name, value in before.items():
-        print(f"  {name} PSNR {value:.2f} -> {after[name]:.2f} dB ({after[name] - value:+.2f})")

@@ -15,7 +15,7 @@ from warp_splat.evaluation.report import BLUE, GREEN, ORANGE, new_panels, plain_
 from warp_splat.formats.files import write_csv
 from warp_splat.formats.model_folder import folder_of, is_file_of_gaussians, read_cfg_args
 from warp_splat.formats.splats import COEFFICIENTS, SplatArrays, SplatFile, sizes
-from warp_splat.pruning.opened import Opened, output_of, print_quality, require_some, write, written_bytes
+from warp_splat.pruning.opened import Opened, output_of, require_some, write, written_bytes
 from warp_splat.pruning.thinning import Thinning, fewer_harmonics, model_of, tuned
 from warp_splat.rendering.changes import largest_change
 from warp_splat.rendering.finished import Finished
@@ -79,7 +79,7 @@ def simplify(config: SimplifyConfig) -> int:
             print("  Without any change, the bound of rounding is more: nothing is left out; raise --tolerance.")
     numbers = np.bincount(degrees_of(splats))
     print(f"  harmonics: {', '.join(f'{number} of degree {degree}' for degree, number in enumerate(numbers))}")
-    print_quality(opened.quality(file.splats), opened.quality(splats))
+    opened.print_quality(file.splats, splats)
     print(f"  what each share costs: {output.with_suffix('.curve.png')}, .csv")
     return code
 
