@@ -47,10 +47,11 @@ def test_transforms_intrinsics_of_frames_go_before_those_of_the_file(tmp_path):
 
 
 def test_a_frame_with_a_focal_length_of_its_own_takes_none_of_the_file(tmp_path):
-    own = [{}, {"camera_angle_x": 1.0}, {"fl_x": 50.0}]
-    scene, _ = load(write_transforms(tmp_path, ["a.png", "b.png", "c.png"], frame=lambda index: own[index]))
+    """That of y none of y."""
+    own = [{}, {"camera_angle_x": 1.0}, {"fl_x": 50.0}, {"fl_y": 50.0}, {"camera_angle_x": None}]
+    scene, _ = load(write_transforms(tmp_path, [f"{name}.png" for name in "abcde"], frame=lambda index: own[index]))
     found = [value for view in scene.train for value in (view.camera.fx, view.camera.fy)]
-    assert found == pytest.approx([40, 44, *[0.5 * WIDTH / np.tan(0.5)] * 2, 50, 50])
+    assert found == pytest.approx([40, 44, *[0.5 * WIDTH / np.tan(0.5)] * 2, 50, 50, 40, 50, 40, 44])
 
 
 @pytest.mark.parametrize("fisheye", [True, 1])
@@ -171,6 +172,7 @@ BAD = {
     "fisheye-p1": (broken(camera_model="OPENCV_FISHEYE", p1=0.1), ["frame 0", "p1 = 0.1"]),
     "model": (broken(camera_model="EQUIRECTANGULAR"), ["frame 0", "EQUIRECTANGULAR"]),
     "fisheye-text": (broken(is_fisheye="true"), ["frame 0: expected is_fisheye as true or false, got 'true'"]),
+    "ftheta": (broken(ftheta_p0=0.0), ["frame 0: expected a lens without ftheta_p0, got 0.0"]),
     "latlong": (broken(latlong=True), ["frame 0: expected a lens without latlong, got True"]),
     "model-list": (broken(camera_model=[1]), ["frame 0", "camera_model"]),
     "focal": (broken(fl_x="wide"), ["frame 0: expected fl_x as a number between", "'wide'"]),

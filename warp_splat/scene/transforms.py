@@ -29,7 +29,7 @@ LARGEST = 1e9  # of a number that describes a lens
 PERSPECTIVE = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "PERSPECTIVE")
 FISHEYE, PANORAMA = "OPENCV_FISHEYE", "EQUIRECTANGULAR"
 UNKNOWN = ("latlong", "ftheta_p0")  # lenses of instant-ngp
-FOCAL = {"fl_x", "fl_y", "camera_angle_x", "camera_angle_y"}  # a frame that has one of them takes none of the file's
+FOCAL = ("fl_x", "camera_angle_x", "fl_y", "camera_angle_y")
 
 
 def read_transforms(
@@ -85,13 +85,19 @@ def _read_photos(path: Path, content: dict[str, Any], report: Report, native: bo
         if found in seen:  # it might be trained on and held out at once
             again.append(name)
             continue
-        shared = {key: content[key] for key in content if key not in FOCAL or not FOCAL & frame.keys()}
-        photos[name] = _photo({**shared, **frame}, found, finder, sampling, where)
+        photos[name] = _photo(_over(content, frame), found, finder, sampling, where)
         seen.add(found)
     if again:
         report(f"Leaving out {len(again)} of {len(names)} frames, whose photographs had one before: {few(again)}.")
     tell_lenses([*photos.values()], report)
     return photos
+
+
+def _over(content: dict[str, Any], frame: dict[str, Any]) -> dict[str, Any]:
+    """The frame's values, and the file's where it has none: no focal length after its own, of y after its own of y."""
+    own = [key for key in FOCAL if frame.get(key) is not None]
+    replaced = FOCAL[FOCAL.index(own[0]) // 2 * 2 :] if own else ()
+    return {key: value for key, value in content.items() if key not in replaced} | frame
 
 
 def _split(
@@ -146,6 +152,8 @@ def _lens(values: dict[str, Any], size: tuple[int, int], where: str) -> Calibrat
             raise _wrong(where, f"{key} as a number between -{LARGEST:g} and {LARGEST:g}", value)
         return float(value)
 
+    if other := [key for key in UNKNOWN if key in values and values[key] is not False]:
+        raise _wrong(where, f"a lens without {other[0]}", values[other[0]])
     width, height = number("w", size[0]), number("h", size[1])
     if not (width.is_integer() and height.is_integer() and min(width, height) >= 1):
         raise InputError(f"{where}: expected w and h as numbers of pixels, got {width} and {height}; correct the file.")
@@ -167,8 +175,6 @@ def _lens(values: dict[str, Any], size: tuple[int, int], where: str) -> Calibrat
     k1, k2, k3, k4, p1, p2 = (number(key) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
     if (fisheye := values.get("is_fisheye") or False) not in (True, False):
         raise _wrong(where, "is_fisheye as true or false", fisheye)
-    if other := [key for key in UNKNOWN if values.get(key)]:
-        raise _wrong(where, f"a lens without {other[0]}", values[other[0]])
     model = values.get("camera_model", FISHEYE if fisheye else "OPENCV")
     if model == FISHEYE and not (p1 or p2):
         params = (*focal, k1, k2, k3, k4)
