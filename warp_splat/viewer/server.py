@@ -37,9 +37,8 @@ PORTS = 100  # that are tried, from the one asked for
 IDLE = 0.2  # seconds between two looks at Ctrl-C
 DESERTED = 10.0  # seconds after the last browser has left; one that loads the page again takes less
 MOVING_QUALITY, SHARP_QUALITY = 75, 95  # of JPEG
+ADVICE = "view fewer Gaussians (train with --max_gaussians), or in a smaller window"
 AS_GIVEN = ", as given"  # behind the name of a photograph whose camera was refined
-
-Draw = Callable[..., RenderOutput]
 
 
 class Viewer:
@@ -59,7 +58,7 @@ class Viewer:
 
     def __init__(
         self,
-        draw: Draw,
+        draw: Callable[..., RenderOutput],
         model: GaussianModel,
         scene: Scene | None,
         port: int,
@@ -97,9 +96,10 @@ class Viewer:
     def _warm_up(self) -> None:
         """Compile and load the kernels of every kind of frame, so that no frame waits for them."""
         camera = Camera(TILE, TILE, TILE, TILE, 0.5 * TILE, 0.5 * TILE, np.eye(3), np.zeros(3))
-        for kind in KINDS:
-            paint(self.draw_camera(camera, kind == "depth"), kind, self.linear)
-        self.draw_camera(camera, median=True)
+        with memory_explained(self.model.device, self.model, [LARGEST], ADVICE):
+            for kind in KINDS:
+                paint(self.draw_camera(camera, kind == "depth"), kind, self.linear)
+            self.draw_camera(camera, median=True)
 
     def __enter__(self) -> "Viewer":
         return self
@@ -156,7 +156,7 @@ class Viewer:
         start = time.perf_counter()
         watcher.changed, watcher.sharp, watcher.drawn_at = False, not moving, time.monotonic()
         try:
-            with memory_explained(self.model.device, self.model, [LARGEST], "look from farther away"):
+            with memory_explained(self.model.device, self.model, [LARGEST], ADVICE):
                 frame, note = self._frame(watcher, watcher.pixels if moving else MOST)
         except InputError as error:  # a folded window, a lens, no memory, a photograph that cannot be read
             watcher.note.content = str(error)
