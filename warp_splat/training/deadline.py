@@ -21,6 +21,7 @@ from warp_splat.training.trial import suggested
 REACHED = Path(__file__).with_name("reached.json")  # what benchmarks/minutes.py measured
 REPEATS = 5  # steps of which one is timed: their median
 WINDOW = 20  # parts of a training: as far back as the pace is looked at, which is from one evaluation to the next
+APART = 50  # images between two evaluations, at least
 FULL_WINDOW = 8  # likewise, of the steps at full size
 FEWEST = 10  # images by which a pace is known
 WIDER = 1.35  # than copies that cover what the start does: so they take 0.8 to 1.05 of trained ones' time (4 scenes)
@@ -43,7 +44,7 @@ class Deadline:
         self.seconds, self.cooldown = 60.0 * learn.minutes, learn.cooldown
         self.full_size = learn.coarse_until_iter * shares[-1] if shares else 0.0  # the step from which they have it
         self.fewest = max(-(-FEWEST // count), 2)
-        window = min(learn.iterations / WINDOW, (learn.iterations - self.full_size) / FULL_WINDOW)
+        window = min(max(learn.iterations / WINDOW, APART), (learn.iterations - self.full_size) / FULL_WINDOW)
         self.past: deque[tuple[int, float]] = deque(maxlen=max(int(window / count), self.fewest))
         self.near = math.inf  # the step since which the end is near by each pace that was seen
 

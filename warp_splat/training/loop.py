@@ -17,14 +17,14 @@ from warp_splat.errors import InputError
 from warp_splat.formats.png import save_png
 from warp_splat.runtime import timers
 from warp_splat.training.config_file import write_config
-from warp_splat.training.deadline import Deadline
+from warp_splat.training.deadline import APART, Deadline
 from warp_splat.training.record import Run, keep, save_or_warn, warn
 from warp_splat.training.trainer import Trainer
 
 if TYPE_CHECKING:
     from warp_splat.training.live import TrainingViewer
 
-EVALUATIONS, APART = 20, 50  # over the run, besides --test_iterations; steps between two, at least
+EVALUATIONS = 20  # over the run, at most, besides --test_iterations
 PROGRESS_VIEWS = 8  # at most, in the evaluations while training
 PREVIEW_SECONDS = 5.0
 KEEP, STOP = 1, 2  # what a process may wish after a step: a checkpoint, an end
