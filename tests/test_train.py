@@ -185,7 +185,7 @@ def test_first_step_loads_only_what_it_needs():
         (("--threads", "-1"), ("--threads", "-1")),
         (("--verify", "abc"), ("--verify", "sha256", "abc")),
         (("--verify", "0" * 65), ("--verify", "sha256", "000")),
-        (("--verify", ""), ("--verify", "a word", "empty")),
+        (("--verify", ""), ("--verify", "a hash", "empty")),
         (("--start_ply", ""), ("--start_ply", "a path", "empty")),
         (("--lpips_weights", ""), ("--lpips_weights", "a path", "empty")),
         (("-s", "/no/such/scene"), ("/no/such/scene",)),

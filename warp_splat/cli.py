@@ -8,7 +8,6 @@ import pkgutil
 import re
 import signal
 import sys
-from dataclasses import fields
 from typing import Any
 
 from warp_splat import __version__, config
@@ -38,9 +37,7 @@ COMMANDS = {
 }
 
 #: Flags whose default, none, is not meant by who gives them an empty text.
-NEVER_EMPTY = (
-    "source_path model_path start_checkpoint start_ply config lpips_weights verify video_output out output program case"
-).split()
+NEVER_EMPTY = "source_path model_path start_checkpoint start_ply config lpips_weights verify video_output out".split()
 UNUSUAL = re.compile(r"-(inf|[\d.]+e[-+]?\d+)", re.IGNORECASE)  # numbers that argparse takes for flags, without a space
 
 
@@ -107,7 +104,8 @@ def parse(arguments: list[str]) -> Any:
     values = {name: value for name, value in vars(known).items() if name != "command"}
     for name in NEVER_EMPTY:
         if values.get(name) == "":  # mostly a variable of a shell that was never set
-            raise InputError(f"--{name}: expected a word or a path, got an empty one; leave the flag out or name one.")
+            what = "a hash" if name == "verify" else "a path"
+            raise InputError(f"--{name}: expected {what}, got an empty one; leave the flag out or name one.")
     if values.get("crop") == []:
         raise InputError("--crop: expected six numbers, got none; leave the flag out or name a box.")
     if config_type is not TrainConfig:
@@ -134,10 +132,6 @@ def parse(arguments: list[str]) -> Any:
         values = {**embedded[""], **PRESETS[preset], **embedded[preset], **values, "preset": preset}
     options = TrainConfig(**values)
     check_train(options)
-    for name, part in PARTS.items() if options.model.parts != AUTO else ():
-        idle = [item.name for item in fields(part.options) if given.get(item.name)]
-        if idle and name not in options.used_parts:
-            raise InputError(f"--{idle[0]}: expected --parts {name} beside it; name the part, or leave this flag out.")
     return options
 
 
