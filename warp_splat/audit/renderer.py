@@ -91,10 +91,10 @@ class Renderer:
     def close(self) -> None:
         """End the process."""
         if self.process is not None:
-            with suppress(ProcessLookupError, AttributeError):  # what it has started, too
-                os.killpg(self.process.pid, signal.SIGKILL)
             self.process.kill()
             self.process.join()
+            with suppress(OSError, AttributeError):  # what it has started, which may tidy up; Windows has no groups
+                os.killpg(self.process.pid, signal.SIGTERM)
             self.process = None
 
 
@@ -120,7 +120,7 @@ def function_of(place: str):
 
 def _serve(connection, place: str) -> None:
     """The loop of the process: Gaussians in, picture and gradients out, or a phrase that says what went wrong."""
-    with suppress(AttributeError):  # Windows has none
+    with suppress(AttributeError):
         os.setsid()  # Ctrl-C is for the one that asks
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # what it prints is not the audit's to say
     try:
