@@ -43,7 +43,7 @@ def test_gltf_holds_what_the_extension_says(tmp_path, ending):
     assert (found["COLOR_0"][:, 3] == np.rint(255 * sigmoid(wanted.opacities))).all()
 
 
-@pytest.mark.parametrize("name", ["a%41b", "a#b c", "100%"])
+@pytest.mark.parametrize("name", ["a%41b", "a#b c", "100%", "a\udcffb"])
 def test_gltf_of_any_name_finds_its_buffer(tmp_path, name):
     save_gaussians(tmp_path / f"{name}.gltf", some_file(3), report=silent)
     (buffer,) = json.loads((tmp_path / f"{name}.gltf").read_text())["buffers"]

@@ -124,10 +124,12 @@ def save_somewhere(path: Path, save: Callable[[Path], object], name: str = "") -
     try:
         save(path)
     except InputError as error:
-        print(f"warning: {error}", file=sys.stderr)
+        from tqdm import tqdm  # noqa: PLC0415 - a training's bar may be shown
+
+        tqdm.write(f"warning: {error}", file=sys.stderr)
         path = Path(tempfile.mkdtemp(prefix="warp_splat-")) / (name or path.name)
         save(path)
-        print(f"It was saved as {path} instead.", file=sys.stderr)
+        tqdm.write(f"It was saved as {path} instead.", file=sys.stderr)
     return path
 
 

@@ -8,6 +8,7 @@ file say where in the world the Gaussians are.
 
 import hashlib
 import json
+import os
 from pathlib import Path
 from urllib.parse import quote
 
@@ -58,7 +59,7 @@ def save_gltf(path: str | Path, file: SplatFile, report: Report = print) -> None
         document["extras"] = {COORDINATES: coordinates}
     if path.suffix.lower() == ".gltf":
         buffer = path.with_name(f"{path.stem}.{hashlib.sha256(data).hexdigest()[:8]}.bin")
-        document["buffers"][0]["uri"] = quote(buffer.name)
+        document["buffers"][0]["uri"] = quote(os.fsencode(buffer.name))
         with atomic_write(path) as temporary:
             temporary.write_text(json.dumps(document, indent=1, allow_nan=False), encoding="utf-8")
             write_bytes(buffer, data)  # last, so that it does not stay alone where the disk becomes full

@@ -127,7 +127,7 @@ class Document:
         if not isinstance((uri := entry["uri"]), str) or uri.startswith("data:"):
             raise Unexpected("a buffer inside the JSON; export it as .glb, or with a .bin file")
         folder = self.path.parent.resolve()
-        path = (folder / unquote(uri)).resolve()  # a null byte raises ValueError, as it should
+        path = (folder / unquote(uri, errors="surrogateescape")).resolve()  # a null byte raises ValueError
         if "://" in uri or "\\" in uri or not path.is_relative_to(folder):
             raise Unexpected(f"a buffer outside of its folder ({uri!r:.80})")
         if not path.is_file():

@@ -78,7 +78,7 @@ def mesh(config: MeshConfig) -> int:
     print(f"{output}: {len(surface.faces)} of {found} triangles{least}, voxels of {voxel:.4g}")
     if config.collision:
         pieces = needed("trimesh").Scene(whole.convex_decomposition(maxConvexHulls=config.collision))  # V-HACD
-        write_bytes(pieces_place, exported(pieces, output.suffix))
+        pieces_place = save_somewhere(pieces_place, lambda place: write_bytes(place, exported(pieces, place.suffix)))
         print(f"{pieces_place}: {len(pieces.geometry)} convex pieces")
     return int(output != Path(config.output))
 

@@ -127,7 +127,7 @@ def write(path: Path, finished: Finished, splats: SplatArrays) -> int:
     before, notes = finished.placed(), finished.beyond_files
     after, size = before._replace(splats=splats), ""
     saved = save_somewhere(path, lambda place: save_gaussians(place, after, notes.append))
-    with suppress(InputError):  # of the folder for temporary files
+    with suppress(InputError, OSError):  # of the folder for temporary files
         size = f", {written_bytes(path, after) / 1e6:.2f} of {written_bytes(path, before) / 1e6:.2f} MB"
     print(f"{saved}: {len(splats.means)} of {len(before.splats.means)} Gaussians{size}")
     if notes:

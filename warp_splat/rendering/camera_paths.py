@@ -26,8 +26,7 @@ def look_at(lens: Camera, place: np.ndarray, target: np.ndarray, up: np.ndarray)
     forward = (target - place) / np.linalg.norm(target - place)
     right = np.cross(forward, up)
     right /= np.linalg.norm(right)
-    rotation = np.stack([right, np.cross(forward, right), forward])
-    return placed_at(lens, rotation, place)
+    return placed_at(lens, np.stack([right, np.cross(forward, right), forward]), place)
 
 
 def placed_at(lens: Camera, rotation: np.ndarray, place: np.ndarray) -> Camera:

@@ -100,7 +100,7 @@ class Exposure:
         """Of all photographs; those of held-out ones are guessed from the nearest that train, once after each step."""
         if self.found:
             return self.found
-        maps, scene = self.maps.detach().cpu().numpy(), self.scene
+        maps, scene = self.maps.detach().cpu().numpy().copy(), self.scene
         train, test = ([view.camera for view in views] for views in (scene.train, scene.test))
         found = [*maps, *guessed(maps, train, test, scene.extent).astype(np.float32)]
         names = [view.name for view in (*scene.train, *scene.test)]
