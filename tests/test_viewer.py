@@ -137,7 +137,7 @@ def test_a_photograph_that_cannot_be_read_is_told_and_ends_nothing(viewer, monke
 @pytest.mark.parametrize(
     ("error", "told"),
     [
-        (InputError("too many tiles"), "too many tiles"),
+        (InputError("rasterize: too many tiles; take fewer."), "too many tiles"),
         (MemoryError(), "Out of memory on cpu"),
         (torch.OutOfMemoryError("CUDA"), "Out of memory on cpu"),
     ],
