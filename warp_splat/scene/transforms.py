@@ -94,7 +94,7 @@ def _read_photos(path: Path, content: dict[str, Any], report: Report, native: bo
 
 
 def _over(content: dict[str, Any], frame: dict[str, Any]) -> dict[str, Any]:
-    """The frame's values, and the file's where it has none: no focal length after its own, of y after its own of y."""
+    """The file's values, and a frame's over them; its own focal length or angle replaces those, of y that of y."""
     own = [key for key in FOCAL if frame.get(key) is not None]
     replaced = FOCAL[FOCAL.index(own[0]) // 2 * 2 :] if own else ()
     return {key: value for key, value in content.items() if key not in replaced} | frame
