@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from commands import no_space
 from hostile import refusal
 from scene_files import write_image
 from scipy.spatial.transform import Rotation
@@ -19,6 +20,7 @@ from warp_splat.color import from_srgb
 from warp_splat.config import MeshConfig
 from warp_splat.formats.exchange import save_gaussians
 from warp_splat.formats.exposures import Exposures
+from warp_splat.formats.files import write_bytes
 from warp_splat.formats.splats import SplatArrays, SplatFile
 from warp_splat.lenses import Lens
 from warp_splat.meshing.command import _grid, photographed, smoothed, surface_in, without_islands
@@ -308,6 +310,18 @@ def test_convex_pieces(model, scene, tmp_path, ending):
     assert 1 <= len(pieces) <= 2 and all(piece.is_convex for piece in pieces)
     volume = sum(piece.volume for piece in pieces)
     assert volume == pytest.approx(4 / 3 * np.pi * radius**3, rel=0.3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("full", ["ball.ply", "ball_collision.ply"])
+def test_a_full_disk_loses_no_surface(model, scene, tmp_path, monkeypatch, full):
+    pytest.importorskip("vhacdx", reason="no vhacdx: pip install 'warp-splat[mesh]'")
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    write = lambda path, data: (no_space if path == tmp_path / full else write_bytes)(path, data)  # noqa: E731
+    monkeypatch.setattr("warp_splat.meshing.command.write_bytes", write)
+    arguments = [str(model[0]), str(tmp_path / "ball.ply"), "-s", scene, "--triangles", "400", "--collision", "2"]
+    assert main(["mesh", *arguments]) == 1
+    assert {path.name for path in tmp_path.rglob("*.ply")} == {"ball.ply", "ball_collision.ply"}
 
 
 @pytest.mark.parametrize(

@@ -78,7 +78,7 @@ class Renderer:
     def _receive(self, limit: float, serves: bool = True):
         """What the process answers; ``serves``: whether it goes on after it has refused."""
         try:
-            found = self.connection.recv() if self.connection.poll(limit) else f"hangs: no answer in {limit:.0f} s"
+            found = self.connection.recv() if self.connection.poll(limit) else f"hangs: no answer in {limit:g} s"
         except (EOFError, OSError):
             self.process.join()
             found = f"crashes: its process ended with {self.process.exitcode}"

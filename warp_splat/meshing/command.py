@@ -74,13 +74,15 @@ def mesh(config: MeshConfig) -> int:
         surface = surface._replace(vertices=surface.vertices.clip(*np.reshape(config.crop, (2, 3))))
     whole = trimesh_of(surface)
     output = save_somewhere(output, lambda place: write_bytes(place, exported(whole, place.suffix)))
+    elsewhere = output != Path(config.output)
     least = ", the fewest that simplifying comes to" if 0 < config.triangles < 0.9 * len(surface.faces) else ""
     print(f"{output}: {len(surface.faces)} of {found} triangles{least}, voxels of {voxel:.4g}")
     if config.collision:
         pieces = needed("trimesh").Scene(whole.convex_decomposition(maxConvexHulls=config.collision))  # V-HACD
-        pieces_place = save_somewhere(pieces_place, lambda place: write_bytes(place, exported(pieces, place.suffix)))
-        print(f"{pieces_place}: {len(pieces.geometry)} convex pieces")
-    return int(output != Path(config.output))
+        placed = save_somewhere(pieces_place, lambda place: write_bytes(place, exported(pieces, place.suffix)))
+        print(f"{placed}: {len(pieces.geometry)} convex pieces")
+        elsewhere |= placed != pieces_place
+    return int(elsewhere)
 
 
 def needed(package: str) -> Any:

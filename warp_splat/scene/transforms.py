@@ -95,9 +95,9 @@ def _read_photos(path: Path, content: dict[str, Any], report: Report, native: bo
 
 def _over(content: dict[str, Any], frame: dict[str, Any]) -> dict[str, Any]:
     """The file's values, and a frame's over them; its own focal length or angle replaces those, of y that of y."""
-    own = [key for key in FOCAL if frame.get(key) is not None]
-    replaced = FOCAL[FOCAL.index(own[0]) // 2 * 2 :] if own else ()
-    return {key: value for key, value in content.items() if key not in replaced} | frame
+    own = {key: value for key, value in frame.items() if value is not None}
+    first = next((place for place, key in enumerate(FOCAL) if key in own), len(FOCAL))
+    return {key: value for key, value in content.items() if key not in FOCAL[first // 2 * 2 :]} | own
 
 
 def _split(
@@ -152,7 +152,7 @@ def _lens(values: dict[str, Any], size: tuple[int, int], where: str) -> Calibrat
             raise _wrong(where, f"{key} as a number between -{LARGEST:g} and {LARGEST:g}", value)
         return float(value)
 
-    if other := [key for key in UNKNOWN if key in values and values[key] is not False]:
+    if other := [key for key in UNKNOWN if values.get(key) is not None and values[key] is not False]:
         raise _wrong(where, f"a lens without {other[0]}", values[other[0]])
     width, height = number("w", size[0]), number("h", size[1])
     if not (width.is_integer() and height.is_integer() and min(width, height) >= 1):
