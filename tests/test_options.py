@@ -153,9 +153,9 @@ def test_flags_go_before_the_preset_and_the_preset_before_defaults():
     assert embedded.learn.iterations == EMBEDDED_DEFAULTS["fast"]["iterations"]
 
 
-@pytest.mark.parametrize("flag", ["-s", "-m", "--resume", "--config"])
-def test_empty_paths_are_refused(flag):
-    refusal(lambda: parse(["train", flag, ""]), "an empty one")
+@pytest.mark.parametrize("words", ["train -s", "train -m", "train --resume", "train --config", "simplify x -o"])
+def test_empty_paths_are_refused(words):
+    refusal(lambda: parse([*words.split(), ""]), "an empty one")
 
 
 def test_presets_are_made_of_documented_flags():
