@@ -37,7 +37,7 @@ COMMANDS = {
 }
 
 #: Flags whose default, none, is not meant by who gives them an empty text.
-NEVER_EMPTY = "source_path model_path start_checkpoint start_ply config lpips_weights verify video_output out".split()
+NAMED = "source_path model_path start_checkpoint start_ply config lpips_weights verify video_output out output".split()
 UNUSUAL = re.compile(r"-(inf|[\d.]+e[-+]?\d+)", re.IGNORECASE)  # numbers that argparse takes for flags, without a space
 
 
@@ -102,7 +102,7 @@ def parse(arguments: list[str]) -> Any:
         what = "no such flag" if re.match("-[^0-9]", unknown[0]) else "an argument too many"
         raise InputError(f"{unknown[0]}: {what}; {hint}")
     values = {name: value for name, value in vars(known).items() if name != "command"}
-    for name in NEVER_EMPTY:
+    for name in NAMED:
         if values.get(name) == "":  # mostly a variable of a shell that was never set
             what = "a hash" if name == "verify" else "a path"
             raise InputError(f"--{name}: expected {what}, got an empty one; leave the flag out or name one.")

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from scipy.spatial import KDTree
 from torch.autograd.function import once_differentiable
 
 from warp_splat.formats.curve import along_curve, keys_of
@@ -119,6 +118,8 @@ class GaussianModel:
 
         A point becomes a ball as wide as the root mean squared distance to its three nearest neighbors, opacity 0.1.
         """
+        from scipy.spatial import KDTree  # noqa: PLC0415 - slow to load, and only trainings start from points
+
         neighbors = min(4, len(points))  # the point itself and three others
         tree, centers, colors = KDTree(points), points[own], colors[own]
         count = len(centers)

@@ -3,7 +3,6 @@
 import warnings
 
 import numpy as np
-from scipy.cluster.vq import kmeans2
 
 ENTRIES = 256  # of a codebook: an index is a byte
 LLOYD_STEPS = 40  # of a codebook, after which entries move by less than float32 resolves in a picture
@@ -71,6 +70,8 @@ def palette(vectors: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
 
 def _cluster(vectors: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Centers [P, D], P <= ``count``, each with a member, and labels, by k-means from evenly spaced vectors."""
+    from scipy.cluster.vq import kmeans2  # noqa: PLC0415 - slow to load, and most read palettes or none
+
     start = vectors[np.arange(count) * len(vectors) // count]
     with warnings.catch_warnings(action="ignore"):  # of centers without members, which are left out below
         centers, labels = kmeans2(vectors, start, iter=KMEANS_STEPS, minit="matrix")

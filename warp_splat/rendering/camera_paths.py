@@ -3,8 +3,6 @@
 from dataclasses import replace
 
 import numpy as np
-from scipy.interpolate import CubicSpline
-from scipy.spatial.transform import Rotation, RotationSpline
 
 from warp_splat.camera import Camera
 from warp_splat.errors import InputError
@@ -110,6 +108,9 @@ def path_cameras(scene: Scene, count: int, lens: Camera) -> list[Camera]:
     Raises:
         InputError: if all cameras are at one place and look one way.
     """
+    from scipy.interpolate import CubicSpline  # noqa: PLC0415 - slow to load, and other paths do without
+    from scipy.spatial.transform import Rotation, RotationSpline  # noqa: PLC0415
+
     cameras = [view.camera for view in scene.train]
     steps = _distances(cameras, scene.extent)
     named, tour = np.arange(len(cameras)), _tour(steps)

@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 import OpenImageIO as oiio
 import torch
-from matplotlib.figure import Figure
 from tqdm import tqdm
 
 from warp_splat.camera import Camera
@@ -58,6 +57,8 @@ def write_maps(name: str, find: Callable[[Camera], torch.Tensor], views: list[Vi
 
 def save_scaled(path: Path, values: np.ndarray) -> None:
     """Positive ``values`` [H, W] as colors, with the scale beside them."""
+    from matplotlib.figure import Figure  # noqa: PLC0415 - slow to load, only for these
+
     height, width = values.shape
     figure = Figure(figsize=(width / DPI + 1.0, height / DPI), dpi=DPI)
     axes = figure.add_axes((0.0, 0.0, width / (width + DPI), 1.0))

@@ -95,9 +95,9 @@ def _read_photos(path: Path, content: dict[str, Any], report: Report, native: bo
 
 def _over(content: dict[str, Any], frame: dict[str, Any]) -> dict[str, Any]:
     """The file's values, and a frame's over them; its own focal length or angle replaces those, of y that of y."""
-    own = {key: value for key, value in frame.items() if value is not None}
+    own, shared = ({key: value for key, value in one.items() if value is not None} for one in (frame, content))
     first = next((place for place, key in enumerate(FOCAL[:3]) if key in own), len(FOCAL))
-    return {key: value for key, value in content.items() if key not in FOCAL[first // 2 * 2 :]} | own
+    return {key: value for key, value in shared.items() if key not in FOCAL[first // 2 * 2 :]} | own
 
 
 def _split(
