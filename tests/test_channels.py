@@ -184,3 +184,20 @@ def test_bad_input(features, options, found):
     scene = SCENES["degree1"]()
     with pytest.raises(InputError, match=found):
         warp_splat.rasterize(*scene.parameters(), scene.camera, options=options, features=features)
+
+
+def test_planes_are_those_of_a_scene_beside_the_origin(driver):
+    """Where it lies far away, so much that float32 has no more digits than it needs for the means."""
+    scene, shift = SCENES["degree1"](), torch.tensor([2.0**17, -(2.0**16), 3 * 2.0**15])
+    found = []
+    for far in (torch.zeros(3), shift):
+        leaves = leaves_of(scene, features_of(scene, 5))
+        near = (leaves[0].detach() + shift) - shift  # as far as they can be told there
+        leaves[0] = (near + far).requires_grad_()
+        camera = replace(
+            scene.camera, translation=scene.camera.translation - scene.camera.rotation @ far.double().numpy()
+        )
+        out = render(replace(scene, camera=camera), leaves, ALL)
+        found.append([out.planes, *torch.autograd.grad(out.planes.sum(), leaves[:4])])
+    for one, other in zip(*found, strict=True):
+        assert (one - other).norm() < 1e-5 * one.norm()

@@ -48,8 +48,9 @@ def blend_beside(
     channels, found, options = {} if features is None else {"features": features}, {}, blending.options
     if options.normals:
         center = (camera.camera if isinstance(camera, CameraParameters) else camera).center.tolist()
-        # number by number, since a copy of the center would make a GPU wait
-        away = torch.stack([mean - value for mean, value in zip(gaussians.means.unbind(1), center, strict=True)], 1)
+        # number by number, since a copy of the center would make a GPU wait; it may be far from the origin
+        means = gaussians.means.double().unbind(1)
+        away = torch.stack([mean - value for mean, value in zip(means, center, strict=True)], 1).float()
         normals = normals_of(gaussians, away.detach())
         channels |= {"normals": normals, "planes": (normals * away).sum(1, keepdim=True)}
     if channels:

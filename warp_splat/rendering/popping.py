@@ -44,8 +44,8 @@ def _depth_extents(gaussians: Gaussians, camera: Camera) -> torch.Tensor:
     """Standard deviations along the axis of the camera, or of a wide lens along the ray to the mean, [N]."""
     axis = torch.tensor(camera.rotation[2], dtype=torch.float32, device=gaussians.means.device).expand(1, 3)
     if camera.lens and camera.lens.family.wide:
-        center = torch.tensor(camera.center, dtype=torch.float32, device=axis.device)
-        axis = torch.nn.functional.normalize(gaussians.means - center, dim=1)
+        away = gaussians.means - torch.from_numpy(camera.center).to(axis.device)
+        axis = torch.nn.functional.normalize(away.float(), dim=1)
     return ((axis[:, None] @ rotations(gaussians.quats))[:, 0] * gaussians.scales).norm(dim=1)
 
 
