@@ -213,7 +213,7 @@ def test_a_scene_with_coordinates_is_upright_and_says_where(tmp_path):
     where = {
         "origin": UTM.tolist(),
         "reference": "UTM",
-        "residuals": {"a": 0.5, "b": 0.25, "c": 9.0},
+        "residuals": {"a": 0.5, "b": 0.25, "c": 9.0, "d": 0.25, "e": 0.375},
         "left_out": ["c"],
     }
     write_coordinates(tmp_path / "scene", where)
@@ -222,7 +222,11 @@ def test_a_scene_with_coordinates_is_upright_and_says_where(tmp_path):
     write_cameras(tmp_path, scene.test, scene.train, scene.coordinates)
     assert json.loads((tmp_path / "cameras.json").read_text())[3]["origin"] == UTM.tolist()
     (finding,) = check_coordinates(Subject(tmp_path / "scene", tmp_path))
-    for words in ("UTM, origin at 691000.25, 5335000.5, 520", "the worst, a, within 0.5 m", "left out: c"):
+    for words in (
+        "UTM, origin at 691000.25, 5335000.5, 520; 4 fit within 0.31 m (median)",
+        "the worst, a, within 0.5 m",
+        "left out: c",
+    ):
         assert words in finding.text
     assert finding.level == "warning"
 

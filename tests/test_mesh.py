@@ -25,7 +25,8 @@ from warp_splat.formats.splats import SplatArrays, SplatFile
 from warp_splat.lenses import Lens
 from warp_splat.meshing.command import _grid, photographed, smoothed, surface_in, without_islands
 from warp_splat.meshing.fusion import Drawn, Surface, agreed, depth_of, pixel, surface_of, voxels_of
-from warp_splat.meshing.stereo import filled
+from warp_splat.meshing.stereo import _small, filled
+from warp_splat.pruning.opened import Opened
 from warp_splat.rendering.finished import as_photographed
 from warp_splat.scene.types import Decoded, View
 
@@ -185,6 +186,27 @@ def test_holes_are_closed(threads, seen):
     np.testing.assert_allclose(found[0].colors, np.float32([[0.2, 0.5, 0.8]]).repeat(len(mesh.vertices), 0), atol=1e-5)
 
 
+def test_a_wrong_depth_bores_into_nothing_solid():
+    """Of one view, in the middle of a ball."""
+    views = [ball(index) for index in range(VIEWS)]
+    views[0].depth[20:40, 30:50] = DISTANCE
+    voxels = voxels_of(views, VOXEL)
+    box = torch.cartesian_prod(*(torch.arange(axis.min() - 1, axis.max() + 2, dtype=torch.int32) for axis in voxels.T))
+    found = surface_in(box, views, VOXEL, True)
+    mesh = trimesh.Trimesh(found.vertices, found.faces, process=False)
+    assert mesh.volume == pytest.approx(4 / 3 * np.pi, rel=0.03) and np.linalg.norm(found.vertices, axis=1).min() > 0.9
+
+
+def test_the_rim_of_a_mask_is_no_texture():
+    """Of a photograph of four times a view's pixels."""
+    camera, picture = replace(camera_at(0), width=1024, height=1024), np.full((1024, 1024, 3), 230, np.uint8)
+    y, x = np.ogrid[:1024, :1024]
+    shown = SimpleNamespace(picture=picture, mask=((x - 500) ** 2 + (y - 500) ** 2 > 300**2).astype(np.uint8))
+    gray = _small(Drawn(camera, torch.ones(1024, 1024), torch.zeros(1024, 1024, 3)), shown).image
+    assert 0.5 < (gray > 0).float().mean() < 0.8 and (gray < 0).any()
+    assert (torch.where(gray < 0, 230 / 255, gray) - 230 / 255).abs().max() < 1e-6 and gray.min() == -1
+
+
 @pytest.mark.parametrize(("subdivisions", "stays"), [((4, 0), False), ((7, 3), True)])
 def test_islands(subdivisions, stays):
     """One of less than 1 % of the largest one's triangles, and one that has many of its own."""
@@ -274,11 +296,13 @@ def test_the_command(model, scene, tmp_path, capsys, ending):
     assert "triangles" in capsys.readouterr().out
 
 
-def test_the_command_closes_holes(model, scene, tmp_path):
-    """The ball has one below, where no camera is."""
+def test_the_command_closes_holes(model, scene, tmp_path, capsys, monkeypatch):
+    """The ball has one below, where no camera is. Where it is in the world, a mesh does not tell."""
+    monkeypatch.setattr(Opened, "placed", lambda self: self.file._replace(coordinates={"origin": [1.0, 2.0, 3.0]}))
     arguments = [str(model[0]), str(tmp_path / "ball.ply"), "-s", scene, "--voxel", "0.04", "--watertight"]
     assert main(["mesh", *arguments]) == 0
     assert trimesh.load(tmp_path / "ball.ply", process=False).is_watertight
+    assert "lost: where they are in the world" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("options", [["--triangles", "200"], ["--watertight"]])

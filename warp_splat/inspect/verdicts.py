@@ -70,7 +70,7 @@ def check_coordinates(subject: Subject) -> Iterator[Finding]:
     fitting = sorted((size, name) for name, size in residuals.items() if name not in left_out)
     text = f"{found.get('reference')}, origin at {', '.join(f'{x:.12g}' for x in found['origin'])}"
     if fitting:
-        (half, _), (worst, name) = fitting[len(fitting) // 2], fitting[-1]
+        half, (worst, name) = np.median([size for size, _ in fitting]), fitting[-1]
         text += f"; {len(fitting)} fit within {half:.2g} m (median), the worst, {name}, within {worst:.2g} m"
     rest = f"; {len(left_out)} were left out: {few(map(str, left_out))}" if left_out else ""
     yield Finding("coordinates", "warning" if left_out else "ok", f"{text}{rest}.")

@@ -15,6 +15,7 @@ from scipy.spatial import KDTree
 from warp_splat.color import from_srgb, to_srgb
 from warp_splat.config import STRONGEST_MOST, MeshConfig
 from warp_splat.errors import InputError, imported
+from warp_splat.formats.exchange import MARKS
 from warp_splat.formats.exposures import Exposures
 from warp_splat.formats.files import save_somewhere, write_bytes
 from warp_splat.formats.model_folder import check_output
@@ -77,6 +78,8 @@ def mesh(config: MeshConfig) -> int:
     elsewhere = output != Path(config.output)
     least = ", the fewest that simplifying comes to" if 0 < config.triangles < 0.9 * len(surface.faces) else ""
     print(f"{output}: {len(surface.faces)} of {found} triangles{least}, voxels of {voxel:.4g}")
+    if opened.placed().coordinates:
+        print(f"  lost: {MARKS['coordinates']}")
     if config.collision:
         pieces = needed("trimesh").Scene(whole.convex_decomposition(maxConvexHulls=config.collision))  # V-HACD
         placed = save_somewhere(pieces_place, lambda place: write_bytes(place, exported(pieces, place.suffix)))

@@ -24,6 +24,7 @@ COARSEST = 3.0  # voxels that a pixel of a depth may span
 TRUNCATION = 3.0  # voxels
 AGREEING = 0.2  # share of the views asked that see a place where a pixel sees it, or its depth does not count
 TOLERANCE = 0.01  # of the depth, within which that is the same place
+SURE = 3  # of twenty views or more, by which closing goes: what one or two saw wrongly would bore into a solid
 OTHERS = 40  # views that are asked, those that are nearest
 HALF = 1 << 20  # blocks, and voxels from the middle, lie between -HALF and HALF
 
@@ -67,10 +68,10 @@ def depth_of(shown: RenderOutput, camera: Camera) -> torch.Tensor:
     half = (sums < 0.5 * sums[..., -1:]).sum(-1, keepdim=True).clamp_max(weights.shape[-1] - 1)
     middle = numbers.gather(-1, order.gather(-1, half))[..., 0].clamp_min(0)
     ray = rays(camera, weights.device)
-    center = torch.from_numpy(camera.center.astype(np.float32)).to(ray)
+    away = (gaussians.means[middle] - torch.from_numpy(camera.center).to(ray.device)).float()
     flatness = gaussians.scales.amin(1, keepdim=True) / gaussians.scales
     axes = (rotations(gaussians.quats).mT * flatness[..., None])[middle]  # to where the Gaussian is a ball
-    along, mean = ((axes * x[..., None, :]).sum(-1) for x in (ray, gaussians.means[middle] - center))
+    along, mean = ((axes * x[..., None, :]).sum(-1) for x in (ray, away))
     return torch.where(shown.alpha > 0.5, (along * mean).sum(-1) / (along * along).sum(-1), 0.0)
 
 
@@ -137,8 +138,10 @@ def code(places: torch.Tensor) -> torch.Tensor:
     return (x << 42) | (y << 21) | z
 
 
-def fused(views: Sequence[Drawn], voxels: torch.Tensor, voxel: float) -> tuple[torch.Tensor, torch.Tensor]:
-    """The distance at each voxel over the truncation, NaN where no view sees it, [V]; its color [V, 3]."""
+def fused(
+    views: Sequence[Drawn], voxels: torch.Tensor, voxel: float, least: int = 1
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """The distance at each voxel over the truncation, NaN where fewer views see it, [V]; its color [V, 3]."""
     sums, colors = torch.zeros(len(voxels), 2), torch.zeros(len(voxels), 4)
     places = launch.view(voxels, wp.vec3i)
     for view in views:
@@ -147,7 +150,7 @@ def fused(views: Sequence[Drawn], voxels: torch.Tensor, voxel: float) -> tuple[t
         pictures = launch.view(view.depth, wp.float32), launch.view(view.image, wp.vec3)
         made = [launch.view(sums, wp.vec2), launch.view(colors, wp.vec4)]
         launch.launch(fuse, len(voxels), [voxel, TRUNCATION * voxel, *pose, lens_of(camera), places, *pictures], made)
-    distance = torch.where(sums[:, 1] > 0, sums[:, 0] / sums[:, 1], torch.nan)
+    distance = torch.where(sums[:, 1] >= least, sums[:, 0] / sums[:, 1], torch.nan)
     return distance, colors[:, :3] / colors[:, 3:].clamp_min(1.0)
 
 
@@ -169,7 +172,7 @@ def closed(voxels: torch.Tensor, distances: torch.Tensor, colors: torch.Tensor) 
 
 def surface_of(voxels: torch.Tensor, views: Sequence[Drawn], voxel: float, watertight: bool = False) -> Surface:
     """Marching cubes in the cells of which all corners are seen: holes stay holes, unless it is to be watertight."""
-    distances, colors = fused(views, voxels, voxel)
+    distances, colors = fused(views, voxels, voxel, min(SURE, 1 + len(views) // 10) if watertight else 1)
     if watertight and (distances.abs() < 1).any():
         voxels, distances, colors = closed(voxels, distances, colors)
     known = (~torch.isnan(distances)).nonzero()[:, 0]

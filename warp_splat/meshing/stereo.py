@@ -54,10 +54,11 @@ def _small(view: Drawn, photograph: View) -> Drawn:
     share = min(1.0, math.sqrt(MOST / view.depth.numel()))
     small = Drawn(view.camera.resized(*(max(int(share * size), FEWEST) for size in view.depth.T.shape)), *view[1:])
     gray = torch.from_numpy(photograph.picture).float().mean(2, keepdim=True) / 255
+    image, depth = image_at(gray, small.camera, "area"), image_at(view.depth[..., None], small.camera)[..., 0]
     if photograph.mask is not None:
-        gray[torch.from_numpy(photograph.mask == 0)] = -1.0
-    depth = image_at(view.depth[..., None], small.camera)[..., 0]
-    return small._replace(depth=depth, image=image_at(gray, small.camera, "area"))
+        hidden = torch.from_numpy(photograph.mask[..., None] == 0).float()
+        image[image_at(hidden, small.camera, "area") > 0] = -1.0
+    return small._replace(depth=depth, image=image)
 
 
 def _nearness(planes: torch.Tensor, camera: Camera) -> torch.Tensor:
