@@ -130,7 +130,8 @@ def test_ctrl_c_and_resume(whole, tmp_path, monkeypatch, capsys, fails):
     assert "already holds" in fails("train", "-s", str(SCENE), "-m", str(folder))
     assert f"--resume {folder}" in fails("train", "--resume", str(named))
     assert "expected at least 60, as in" in fails("train", "--resume", str(folder), "--iterations", "59")
-    for option, value in (("sh_degree", "2"), ("optimizer_type", "sparse_adam"), ("seed", "1"), ("preset", "fast")):
+    others = {"sh_degree": "2", "optimizer_type": "sparse_adam", "seed": "1", "preset": "fast", "start_ply": "a.ply"}
+    for option, value in others.items():
         assert f"--{option} {value}: expected" in fails("train", "--resume", str(folder), f"--{option}", value)
     assert files_of(folder) == before
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import changes_told, full_disk
+from commands import changes_told, full_disk, python
 from common import picture_of
 from hostile import refusal
 from scenes import C0
@@ -158,6 +158,13 @@ def test_a_full_disk_leaves_no_part_of_a_file(tmp_path, ending, left):
     with full_disk(left % size):
         refusal(write, str(tmp_path), "could not be written")
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "latin-1"])
+def test_a_name_that_a_terminal_cannot_say(tmp_path, encoding):
+    save_gaussians(tmp_path / "a.ply", some_file(9))
+    command = ["-m", "warp_splat", "convert", tmp_path / "a.ply", tmp_path / "漢.spz"]
+    assert r"\u6f22.spz" in python(*command, PYTHONIOENCODING=encoding).stdout
 
 
 def test_a_full_disk_leaves_no_buffer_alone(tmp_path, monkeypatch):

@@ -19,6 +19,7 @@ from warp_splat.cli import main
 from warp_splat.color import from_srgb, to_srgb
 from warp_splat.errors import InputError
 from warp_splat.formats.exposures import Exposures, read_exposures
+from warp_splat.formats.model_folder import ply_path
 from warp_splat.formats.png import load_png
 from warp_splat.gaussians import GaussianModel
 from warp_splat.rendering.finished import as_photographed, make_renderer
@@ -122,6 +123,18 @@ def test_the_folder_has_the_maps_in_the_layout_of_the_reference(kind, scene, tmp
     expected = image @ image_map[:3, :3] + image_map[:3, 3]
     assert not torch.allclose(expected, image, atol=1e-4)
     torch.testing.assert_close(trainer.parts[0].image(image, None, SimpleNamespace(view=view)), expected)
+
+
+def test_gaussians_are_saved_with_all_that_they_are_drawn_with(scene, tmp_path, monkeypatch):
+    """Elsewhere, if one of these files cannot be written."""
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    trainer, run = stepped(scene, tmp_path / "model", 3, parts="sky,exposure,pose")
+    own = ply_path(tmp_path / "model", 3)
+    (own.parent / "exposures.json").mkdir(parents=True)
+    path = save_model(trainer, run)
+    saved = {"iteration_3.ply", "environment.json", "exposures.json", "cameras.json"}
+    assert {found.name for found in path.parent.iterdir()} == saved and not own.exists()
+    assert (tmp_path / "model" / "cameras.json").is_file() and (tmp_path / "model" / "exposure.json").is_file()
 
 
 def test_a_held_out_one_is_guessed_where_neighbors_are_alike():

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import started
+from commands import full_disk, started
 from hostile import refusal
 from scene_files import write_colmap
 from scipy.spatial.transform import Rotation
@@ -185,17 +185,15 @@ def test_a_folder_is_claimed_by_one_training(tmp_path):
         pass
 
 
-def test_prepare_refuses_before_training(tmp_path, monkeypatch):
+def test_prepare_refuses_before_training(tmp_path):
     (tmp_path / "file").write_text("")
     for folder in (tmp_path / "file", tmp_path / "file" / "model"):
         with pytest.raises(InputError, match=r"expected a folder that can be written .*; choose another"):
             model_folder.prepare_folder(folder)
 
-    def refuse(*_args, **_keywords):
-        raise PermissionError(13, "Permission denied")
-
-    monkeypatch.setattr(Path, "write_text", refuse)
-    refusal(lambda: model_folder.prepare_folder(tmp_path / "model"), "Permission denied")
+    with full_disk(0):
+        refusal(lambda: model_folder.prepare_folder(tmp_path / "model"), "expected a folder that can be written")
+    assert not list((tmp_path / "model").iterdir())
 
 
 def test_default_model_path_is_new_each_time():

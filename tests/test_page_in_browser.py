@@ -127,6 +127,27 @@ def test_no_pixel_at_the_rim_is_lost_to_rounded_corners(browser, tmp_path):
         assert np.abs(pixels(page, index).astype(int) - picture(camera)).max() <= 1
 
 
+#: Of a card whose textures, or of a browser whose canvases have so many pixels at most.
+LARGEST = """
+const gl = WebGL2RenderingContext.prototype, get = gl.getParameter;
+if (EDGE) gl.getParameter = function (name) { return name === gl.MAX_TEXTURE_SIZE ? 140 : get.call(this, name); };
+const share = (canvas) => Math.min(1, Math.sqrt(140 * 78 / 0.98 / canvas.width / canvas.height));
+for (const [side, of] of EDGE ? [] : [["width", "drawingBufferWidth"], ["height", "drawingBufferHeight"]])
+  Object.defineProperty(gl, of, { get() { return Math.floor(this.canvas[side] * share(this.canvas)); } });
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("edge", ["true", "false"])
+def test_a_window_larger_than_what_can_be_drawn(tmp_path, edge):
+    """Shows the whole picture, of fewer pixels."""
+    folder, picture, cameras = model(tmp_path, some_splats(100))
+    with browser_page(280, 156) as (page, errors):
+        page.add_init_script(LARGEST.replace("EDGE", edge))
+        found = pixels(open_page((page, errors, []), export(folder)), 0)
+    assert psnr(found, picture(cameras[0].resized(140, 78))) > 45
+
+
 def test_small_differences_of_depth_decide_the_order(browser, tmp_path):
     """Of layers 1e-5 apart, in front of or behind one that is far from them."""
     splats = some_splats(20, 1)

@@ -3,6 +3,7 @@
 import argparse
 import atexit
 import difflib
+import io
 import os
 import pkgutil
 import re
@@ -199,6 +200,8 @@ def _check_minutes(given: dict) -> None:
 def main(arguments: list[str] | None = None) -> int:
     """Run a command; returns the exit code: 0, 1 for bad input, 130 for an interruption."""
     alike = os.environ.get("LOCAL_RANK", "0") != "0"  # what another process of this machine says as well
+    if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":  # a name that it lacks ends nothing
+        sys.stdout.reconfigure(errors="backslashreplace")
     try:
         options = parse(sys.argv[1:] if arguments is None else arguments)
         if isinstance(options, TrainConfig) and options.machine.portable:

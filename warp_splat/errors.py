@@ -18,7 +18,7 @@ def tell(error: InputError | OSError) -> None:
     """Print the sentence. Raises ``error`` itself where WARP_SPLAT_TRACEBACK is set."""
     if os.environ.get("WARP_SPLAT_TRACEBACK"):
         raise error
-    text = f"{error.filename or 'file'}: {error.strerror or error}." if isinstance(error, OSError) else error
+    text = f"{error.filename or 'file or output'}: {error.strerror or error}." if isinstance(error, OSError) else error
     print(f"warp-splat: error: {text}", file=sys.stderr, flush=True)
 
 

@@ -41,6 +41,7 @@ def export_html(config: ExportHtmlConfig) -> int:
     """
     if (path := Path(config.page)).suffix.lower() not in (".html", ".htm"):
         raise InputError(f"{path}: expected the name of a page, which ends in .html; found {path.suffix!r}.")
+    model_folder.check_output(path)
     iteration, (splats, *_), trained = model_folder.open_model(config.model, crop=config.crop)
     cameras = [*model_folder.read_refined(config.model, iteration).items()]
     cameras = cameras or model_folder.read_cameras(model_folder.folder_of(config.model))

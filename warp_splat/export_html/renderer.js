@@ -10,9 +10,10 @@ class Renderer {
     const gl = canvas.getContext("webgl2", { antialias: false, alpha: false, depth: false });
     if (!gl) throw new Error("This page needs WebGL 2, which this browser lacks or has switched off.");
     this.gl = gl;
-    this.width = Math.min(4096, gl.getParameter(gl.MAX_TEXTURE_SIZE));
+    this.mostEdge = gl.getParameter(gl.MAX_TEXTURE_SIZE); // px
+    this.width = Math.min(4096, this.mostEdge);
     const rows = (texels) => Math.max(1, Math.ceil(((scene.coarse + scene.count) * texels) / this.width));
-    if (rows(Math.max(2, scene.harmonics)) > gl.getParameter(gl.MAX_TEXTURE_SIZE)) {
+    if (rows(Math.max(2, scene.harmonics)) > this.mostEdge) {
       throw new Error(`${scene.count} Gaussians are more than this graphics card takes; export fewer.`);
     }
     this.gaussians = this.texture(gl.RGBA32UI, this.width, rows(2));

@@ -54,6 +54,7 @@ class Viewer {
     this.sorting = this.requested = false;
     this.lastInput = -Infinity;
     this.waiting = [];
+    this.mostPixels = Infinity;
     new ResizeObserver(() => this.request()).observe(this.canvas);
   }
 
@@ -161,9 +162,18 @@ class Viewer {
     this.requested = false;
     if (!this.camera) return;
     if (!this.renderer.ready) return this.request(); // nothing piles up before a slow card
-    const { canvas } = this, ratio = window.devicePixelRatio;
-    const [width, height] = [canvas.clientWidth, canvas.clientHeight].map((size) => Math.max(1, Math.round(size * ratio)));
-    if (canvas.width !== width || canvas.height !== height) [canvas.width, canvas.height] = [width, height];
+    const { canvas } = this, [wide, high] = [canvas.clientWidth, canvas.clientHeight];
+    const most = Math.min(this.renderer.mostEdge / Math.max(wide, high), Math.sqrt(this.mostPixels / (wide * high)));
+    const ratio = Math.min(window.devicePixelRatio, most);
+    const [width, height] = [wide, high].map((size) => Math.max(1, Math.round(size * ratio)));
+    if (canvas.width !== width || canvas.height !== height) {
+      [canvas.width, canvas.height] = [width, height];
+      const { drawingBufferWidth, drawingBufferHeight } = this.renderer.gl; // a browser may give less
+      if (drawingBufferWidth < width || drawingBufferHeight < height) {
+        this.mostPixels = 0.99 * drawingBufferWidth * drawingBufferHeight;
+        return this.request();
+      }
+    }
     const { rest } = this;
     this.sort();
     const right = rest > 0 ? this.current : this.sortedVersion === this.version && (this.missing || this.current);

@@ -81,6 +81,8 @@ class Checkpoint:
 def save_checkpoint(path: str | Path, arrays: Mapping[str, np.ndarray], facts: Mapping[str, Any]) -> None:
     """Write a checkpoint; an older one of this name is replaced when the new one is complete, on the disk.
 
+    Blocks of the older one are removed then, but those that the new one names.
+
     Args:
         path: the file.
         arrays: float32, float64, int32 or uint8.
@@ -104,6 +106,9 @@ def save_checkpoint(path: str | Path, arrays: Mapping[str, np.ndarray], facts: M
         file.write(struct.pack("<Q", len(encoded)) + encoded)
         for array in arrays.values():
             file.write(array.astype(array.dtype.newbyteorder("<"), copy=False).data)
+    for old in Path(path).parent.glob(f"{Path(path).stem}-*-of-*{Path(path).suffix}"):
+        if old.name not in facts.get(BLOCKS, ()) and old.is_file():
+            old.unlink(missing_ok=True)
 
 
 def load_checkpoint(path: str | Path) -> Checkpoint:
@@ -202,7 +207,7 @@ BLOCKS = "blocks"  # among the facts of a checkpoint: the names of files beside 
 
 
 def save_in_blocks(processes: Processes, path: Path, arrays: Mapping[str, np.ndarray], facts: Mapping) -> None:
-    """Write a checkpoint of all processes, which call this together, and remove the blocks of the one before.
+    """Write a checkpoint of all processes, which call this together.
 
     Raises:
         InputError: if one cannot write its block: in all; the checkpoint before stays whole. If the first one cannot
@@ -222,9 +227,6 @@ def save_in_blocks(processes: Processes, path: Path, arrays: Mapping[str, np.nda
     if processes.rank == 0:
         rest = {name: array for name, array in arrays.items() if name not in own}
         save_checkpoint(path, rest, {**facts, BLOCKS: dict(zip(names, counts, strict=True))})
-        for old in path.parent.glob(f"{path.stem}-*-of-*{path.suffix}"):
-            if old.name not in names:
-                old.unlink(missing_ok=True)
 
 
 def load_own(path: str | Path, processes: Processes) -> Checkpoint:

@@ -123,7 +123,7 @@ def save_somewhere(path: Path, save: Callable[[Path], object], name: str = "") -
     """
     try:
         save(path)
-    except InputError as error:
+    except (InputError, OSError) as error:
         from tqdm import tqdm  # noqa: PLC0415 - a training's bar may be shown
 
         tqdm.write(f"warning: {error}", file=sys.stderr)

@@ -6,6 +6,7 @@
 import ast
 import json
 import os
+import tempfile
 import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -73,11 +74,10 @@ def prepare_folder(folder: str | Path) -> Path:
         InputError: if the folder cannot be created or written.
     """
     folder = Path(folder)
-    probe = folder / f".probe-{uuid.uuid4().hex[:12]}"
     with refusing(OSError, f"{folder}: expected a folder that can be written", "; choose another."):
         folder.mkdir(parents=True, exist_ok=True)
-        probe.write_text("written and removed at the start of a training")
-        probe.unlink()
+        with tempfile.TemporaryFile(dir=folder) as probe:
+            probe.write(b"written and removed at the start of a training")
     return folder
 
 

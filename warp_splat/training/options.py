@@ -221,6 +221,7 @@ FIXED_OPTIONS = {
     "growth": "the statistics of one are not those of the other",
     "portable": "with it, kernels round otherwise",
     "block": "its Gaussians are those of its block",
+    "start_ply": "it goes on from its own Gaussians",
     "seed": "random numbers continue from the checkpoint's",
     "preset": "other options are those of the checkpoint; name the ones to change",
 }
