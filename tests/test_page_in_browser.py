@@ -139,12 +139,12 @@ for (const [side, of] of EDGE ? [] : [["width", "drawingBufferWidth"], ["height"
 
 @pytest.mark.slow
 @pytest.mark.parametrize("edge", ["true", "false"])
-def test_a_window_larger_than_what_can_be_drawn(tmp_path, edge):
+def test_a_window_larger_than_what_can_be_drawn(browser, tmp_path, edge):
     """Shows the whole picture, of fewer pixels."""
     folder, picture, cameras = model(tmp_path, some_splats(100))
-    with browser_page(280, 156) as (page, errors):
+    with browser[0].context.browser.new_page(viewport={"width": 280, "height": 156}) as page:
         page.add_init_script(LARGEST.replace("EDGE", edge))
-        found = pixels(open_page((page, errors, []), export(folder)), 0)
+        found = pixels(open_page((page, [], []), export(folder)), 0)
     assert psnr(found, picture(cameras[0].resized(140, 78))) > 45
 
 
