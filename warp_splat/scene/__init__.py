@@ -239,10 +239,9 @@ def too_near(photos: list[Photo], points: np.ndarray) -> str:
 
 def require_visible(photos: list[Photo], points: np.ndarray, source: str | Path) -> None:
     """Refuse a scene that would only render black, as one in another tool's axes does."""
-    if any(visible(photo.camera, points).any() for photo in photos):
-        return
-    raise InputError(
-        f"{source}: expected points in front of the cameras, but none of the {len(photos)} training cameras sees any "
-        f"of the {len(points)} points; the poses' axes are probably mixed up: COLMAP has world to camera in OpenCV "
-        "axes, transforms.json camera to world in OpenGL axes."
-    )
+    if not any(visible(photo.camera, points).any() for photo in photos):
+        raise InputError(
+            f"{source}: expected points in front of the cameras, but none of the {len(photos)} training cameras sees "
+            f"any of the {len(points)} points; the poses' axes are probably mixed up: COLMAP has world to camera in "
+            "OpenCV axes, transforms.json camera to world in OpenGL axes."
+        )
