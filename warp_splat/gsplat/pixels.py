@@ -70,8 +70,7 @@ def _draw_view(
     colors = colors if "RGB" in wanted else colors.new_zeros(count, 0)
     behind = colors.new_zeros(colors.shape[1]) if behind is None else behind
     spare = max(3 - colors.shape[1], 0)
-    first = torch.cat([colors[:, :3], colors.new_zeros(count, spare)], 1)
-    background = torch.cat([behind[:3], behind.new_zeros(spare)])
+    first, background = (torch.nn.functional.pad(part[..., :3], (0, spare)) for part in (colors, behind))
     parts = (seen.means2d, seen.conics, seen.opacities, first, seen.depths, seen.extents, seen.radii.amax(1))
     splats = Splats2D(*(part.contiguous() for part in parts))
     frame = Camera(request.width, request.height, 1.0, 1.0, 0.0, 0.0, np.eye(3), np.zeros(3))  # its size counts
