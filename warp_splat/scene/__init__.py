@@ -14,7 +14,7 @@ import numpy as np
 from warp_splat.color import from_srgb
 from warp_splat.config import LENSES, NEAR
 from warp_splat.errors import InputError
-from warp_splat.scene.photos import OTHER_PHOTOS, PHOTOS, ImageFinder, find_files, is_video, photo_root, sfm_hint
+from warp_splat.scene.photos import PHOTOS, ImageFinder, find_files, is_video, jpeg_hint, photo_root, sfm_hint
 from warp_splat.scene.types import Scene, View, nearest_shown, visible
 from warp_splat.text import Report
 
@@ -174,8 +174,7 @@ def read_photos(
         raise InputError(f"{source}: {expected}, found a trained model; give the folder of its scene.")
     if photographs := find_files(photo_root(source), PHOTOS):
         raise InputError(f"{source}: {expected}, found {len(photographs)} photographs alone; {sfm_hint(source)}")
-    others = find_files(photo_root(source), OTHER_PHOTOS)
-    hint = f"convert its {len(others)} files such as {others[0]!r} to JPEG or PNG" if others else "give another folder"
+    hint = jpeg_hint(source) or "give another folder"
     raise InputError(f"{source}: {expected}, found none of these and no photographs; {hint}.")
 
 

@@ -50,6 +50,12 @@ def sfm_hint(source: Path) -> str:
     return f"compute the cameras with `{command}` and train on the new folder; `warp-splat train --sfm` does both."
 
 
+def jpeg_hint(source: Path) -> str:
+    """What to do with photographs of other kinds below ``source``, as a part of a sentence; nothing without any."""
+    others = find_files(photo_root(source), OTHER_PHOTOS)
+    return f"convert its {len(others)} files such as {others[0]!r} to JPEG or PNG" if others else ""
+
+
 class ImageFinder:
     """The files of images that a scene names: of exactly this name, or else of this stem.
 

@@ -26,7 +26,7 @@ from warp_splat.formats.files import write_json, write_text
 from warp_splat.runtime.devices import peak_memory
 from warp_splat.scene import has_cameras, images
 from warp_splat.scene.colmap_library import pycolmap, require_pycolmap
-from warp_splat.scene.photos import OTHER_PHOTOS, PHOTOS, VIDEOS, find_files, is_video, photo_root, scene_of, sfm_hint
+from warp_splat.scene.photos import PHOTOS, VIDEOS, find_files, is_video, jpeg_hint, photo_root, scene_of, sfm_hint
 from warp_splat.sfm import mapping, stages
 from warp_splat.sfm.georeference import georeference, read_places, require_named, scale_as_usual
 from warp_splat.sfm.matching import match
@@ -148,13 +148,9 @@ def _claim(source: Path, scene: Path, config: SfmConfig) -> Path:
 
 
 def _nothing_found(source: Path) -> InputError:
-    others, videos = (find_files(photo_root(source), endings) for endings in (OTHER_PHOTOS, VIDEOS))
-    hint = "check the path"
-    if others:
-        hint = f"convert its {len(others)} files such as {others[0]!r} to JPEG or PNG"
-    elif videos:
-        hint = f"name the video itself: {shlex.quote(str(photo_root(source) / videos[0]))}"
-    return InputError(f"{source}: expected photographs ({', '.join(PHOTOS)}), found none; {hint}.")
+    videos = find_files(photo_root(source), VIDEOS)
+    hint = f"name the video itself: {shlex.quote(str(photo_root(source) / videos[0]))}" if videos else "check the path"
+    return InputError(f"{source}: expected photographs ({', '.join(PHOTOS)}), found none; {jpeg_hint(source) or hint}.")
 
 
 def _frames(video: Path, work: Path, config: SfmConfig, say) -> Path:
