@@ -173,9 +173,7 @@ def first_and_last(mean: float, half: float, blocks: int):
     first = wp.ceil(mean - half - 0.5)
     last = wp.floor(mean + half - 0.5)
     low = wp.clamp(wp.floor(first / BLOCK), 0.0, most)
-    high = wp.clamp(wp.floor(last / BLOCK) + 1.0, low, most)
-    if last < first:
-        high = low
+    high = wp.where(last < first, low, wp.clamp(wp.floor(last / BLOCK) + 1.0, low, most))
     return int(low), int(high)
 
 
@@ -233,11 +231,8 @@ def make_beyond(fall_at: wp.Function) -> tuple[wp.Function, wp.Function]:
     @wp.func
     def beyond(low: int, high: int, blocks: int, mean: float, half: float, deviation: float, most: float):
         """The largest alpha outside of the blocks with a center within ``half``; nothing is outside the image."""
-        distance = float(1.0e30)
-        if low > 0:
-            distance = mean + 0.5 - BLOCK * float(low)
-        if high < blocks:
-            distance = wp.min(distance, BLOCK * float(high) + 0.5 - mean)
+        distance = wp.where(low > 0, mean + 0.5 - BLOCK * float(low), 1.0e30)
+        distance = wp.where(high < blocks, wp.min(distance, BLOCK * float(high) + 0.5 - mean), distance)
         # between two centers, there may be no such block
         return wp.where(distance < 1.0e30, farther(wp.max(distance, half) / deviation, most), 0)
 
@@ -310,8 +305,7 @@ def make_spread(falloff: FalloffFunctions) -> wp.Kernel:
                 condition, shift = conditions(rules, mean, conic, sigma, size, z)
                 error = alpha_error(rules, condition, shift, wp.max(0.5 * near, 1.0))
                 hidden = wp.max(rules.floor, rules.seen) * error * (1.0 + error)  # as exp(e) - 1 is less
-                if error > 1.0:  # nothing is known of its place
-                    hidden = opacity
+                hidden = wp.where(error > 1.0, opacity, hidden)  # nothing is known of its place
                 errors_out[i] = wp.vec3(wp.where(error > 1.0, 0.0, error * (1.0 + error)), hidden, errors_out[i][2])
                 depth = int(0)
                 while depth + 1 < begins.shape[0] and begins[depth + 1] <= z:
