@@ -142,10 +142,8 @@ def count_in_front(
             y = 4 * (place // lanes // 4) + place % lanes // 4
         x = wp.min(column + x, surface.shape[1] - 1)
         y = begin + wp.min(line + y, bins.height - 1)
-        low = int(start)
         high = int(bins.ranges[tile][1])
-        if not surface[y, x] > 0.0:
-            low = high
+        low = wp.where(surface[y, x] > 0.0, start, high)
         while low < high:
             middle = (low + high) // 2
             if bins.splats[bins.instances[middle]].depth < surface[y, x]:
