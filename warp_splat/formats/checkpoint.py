@@ -47,10 +47,8 @@ class Checkpoint:
     def array(self, name: str, shape: tuple[int, ...], dtype: type = np.float32) -> np.ndarray:
         """An array by name, of ``dtype`` and ``shape``; -1 stands for any length but 0."""
         found = self.arrays.get(name, np.zeros(0, bool))
-        fits = len(found.shape) == len(shape) and all(
-            length == wanted or (wanted == -1 and length > 0) for length, wanted in zip(found.shape, shape, strict=True)
-        )
-        if not fits or found.dtype != dtype:
+        wanted = [max(length, 1) if side == -1 else side for length, side in zip(found.shape, shape, strict=False)]
+        if found.ndim != len(shape) or [*found.shape] != wanted or found.dtype != dtype:
             raise InputError(
                 f"{self.path}: expected {name!r} as {np.dtype(dtype)} {list(shape)}, found {found.dtype} "
                 f"{list(found.shape)}; start from another checkpoint."
