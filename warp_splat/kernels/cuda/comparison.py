@@ -40,11 +40,8 @@ def pair_at(pictures: PicturesView, row: int, place: int):
     pair = wp.vec2(0.0, 0.0)
     image = pictures.image
     if row >= 0 and row < image.shape[0] and place >= 0 and place < image.shape[1]:
-        value = image[row, place]
-        if value < pictures.limits[0]:  # NaN stays
-            value = pictures.limits[0]
-        elif value > pictures.limits[1]:
-            value = pictures.limits[1]
+        low, high, given = pictures.limits[0], pictures.limits[1], image[row, place]
+        value = where_less(given, low, low, where_less(high, given, high, given))  # NaN stays
         target = float(0.0)
         if pictures.levels.shape[0] > 0:
             target = float(pictures.levels[row, place]) / 255.0
