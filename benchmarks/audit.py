@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from audit_targets import OTHERS, OURS
 
-from warp_splat.audit.command import run_audit, side_by_side, worst_gradient
+from warp_splat.audit.command import side_by_side, tell_rules, worst_gradient
 from warp_splat.audit.judged import RUNS, measure
 from warp_splat.audit.probes import GREEN, NEARLY_ROUND, probe_camera
 from warp_splat.audit.renderer import Renderer, RendererFailed, function_of
@@ -97,7 +97,7 @@ def measured(name: str, scenes: list[str], out: Path, more: bool, pictures: int)
     renderer = Renderer(target.place, limit=120.0)
     facts = json.loads(file.read_text()) if more and file.exists() else {}
     if facts.get("version") != target.version or "worst" not in facts:
-        facts, _ = run_audit(renderer, name, target.degree, ())
+        facts = tell_rules(renderer, name, target.degree)
         facts |= {"version": target.version, "settings": target.settings, "worst": ["", 0.0], "scenes": []}
     facts["scenes"] = [row for row in facts["scenes"] if row["largest"] is not None or row["scene"] not in scenes]
     known = {row["scene"] for row in facts["scenes"]}

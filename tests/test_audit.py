@@ -22,7 +22,7 @@ from audit_targets import own
 from browser import CHROMIUM
 
 from warp_splat.audit import program
-from warp_splat.audit.judged import RUNS, exact_image, measure
+from warp_splat.audit.judged import RUNS, SceneRow, exact_image, measure
 from warp_splat.audit.probes import FOCAL, GREEN, NEARLY_ROUND
 from warp_splat.audit.renderer import Answer, Renderer, _draw, function_of
 from warp_splat.audit.rules import find_rules
@@ -224,7 +224,10 @@ def shown_by(place):
 
 
 @pytest.mark.slow
-def test_what_hangs_ends_with_what_it_has_started(tmp_path):
+def test_what_hangs_ends_with_what_it_has_started(tmp_path, monkeypatch):
+    """And leaves no file."""
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "temporary"))
+    (tmp_path / "temporary").mkdir()
     (tmp_path / "hangs.sh").write_text(f"echo $$ > {tmp_path / 'number'}; exec sleep 600\n")
     renderer = Renderer(f"sh {tmp_path / 'hangs.sh'} {{out}}", limit=5.0)
     (row,) = measure(renderer, {}, scenes=("one",))
@@ -232,7 +235,20 @@ def test_what_hangs_ends_with_what_it_has_started(tmp_path):
     number, end = int((tmp_path / "number").read_text()), time.monotonic() + 20
     while psutil.pid_exists(number) and psutil.Process(number).status() != psutil.STATUS_ZOMBIE:
         assert time.monotonic() < end
-    assert "hangs" in row.verdict
+    assert "hangs" in row.verdict and not list((tmp_path / "temporary").iterdir())
+
+
+def test_ctrl_c_keeps_the_rows_before_it(tmp_path, monkeypatch):
+    def interrupted(*_):
+        yield SceneRow("one", "one of them", "hangs", "error")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("warp_splat.audit.command.measure", interrupted)
+    facts = {"target": "mine", "date": "", "rules": {}, "options": {}, "background": [0.0] * 3}
+    monkeypatch.setattr("warp_splat.audit.command.tell_rules", lambda *_: facts)
+    monkeypatch.setattr(Renderer, "start", lambda self: None)
+    assert main(["audit", "mine:draw", "--out", str(tmp_path)]) == 130
+    assert [row["scene"] for row in json.loads((tmp_path / "audit.json").read_text())["scenes"]] == ["one"]
 
 
 @pytest.mark.slow

@@ -49,25 +49,22 @@ def audit(config: AuditConfig) -> int:
         out = prepare_folder(config.out)
         if config.case:
             return _write_case(renderer, config.degree, config.case, out)
-        facts, rows = run_audit(renderer, config.target, config.degree)
-    write_audit(out, facts, rows)
+        facts, rows = tell_rules(renderer, config.target, config.degree), []
+        try:
+            rows.extend(measure(renderer, facts["options"], config.degree, facts["background"]))
+        finally:  # Ctrl-C, too, loses no row
+            write_audit(out, facts, rows)
     return int(any(row.level in ("warning", "error") for row in rows))
 
 
-def run_audit(
-    renderer: Renderer, name: str, degree: int = 3, scenes: tuple[str, ...] = tuple(SCENES)
-) -> tuple[dict[str, Any], list[SceneRow]]:
-    """What was found of rules, and a row for each scene; prints both."""
+def tell_rules(renderer: Renderer, name: str, degree: int = 3) -> dict[str, Any]:
+    """What is known of a renderer, with the rules that were found; prints those."""
     print(name)
     rules = find_rules(renderer.draw, degree)
     for rule, sentence in rules.sentences.items():
         print(f"  {rule:13s} {sentence}")
-    rows = list(measure(renderer, rules.options, degree, rules.background, scenes))
-    columns = {"scene": "{scene}", "largest": "{largest:.1g}", "mean": "{mean:.1g}", "off": "{off:.1%}"}
-    columns |= {"by its rules": "{own:.1%}", "gradients": worst_gradient, "verdict": "{verdict}"}
-    print(table_of([row.record() for row in rows], columns))
     facts = {"target": name, "date": date.today().isoformat(), "machine": machine(), "degree": degree}
-    return facts | {"rules": rules.sentences, "options": rules.options, "background": rules.background}, rows
+    return facts | {"rules": rules.sentences, "options": rules.options, "background": rules.background}
 
 
 def worst_gradient(record) -> str:
@@ -78,7 +75,10 @@ def worst_gradient(record) -> str:
 
 
 def write_audit(out: Path, facts: dict[str, Any], rows: list[SceneRow]) -> None:
-    """``audit.json`` and ``audit.html`` in ``out``, and the worst scene as ``worst.png``."""
+    """Print the table. ``audit.json`` and ``audit.html`` in ``out``, and the worst scene as ``worst.png``."""
+    columns = {"scene": "{scene}", "largest": "{largest:.1g}", "mean": "{mean:.1g}", "off": "{off:.1%}"}
+    columns |= {"by its rules": "{own:.1%}", "gradients": worst_gradient, "verdict": "{verdict}"}
+    print(table_of([row.record() for row in rows], columns))
     write_json(out / "audit.json", facts | {"scenes": [row.record() for row in rows]})
     findings = [Finding(rule, "note", sentence) for rule, sentence in facts["rules"].items()]
     findings += [Finding(row.scene, row.level, f"{row.shows}: {row.verdict}") for row in rows]

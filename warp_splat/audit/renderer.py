@@ -4,6 +4,7 @@ import importlib
 import multiprocessing
 import os
 import signal
+import tempfile
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
@@ -51,7 +52,8 @@ class Renderer:
         if self.process is None:
             context = multiprocessing.get_context("spawn")
             self.connection, other = context.Pipe()
-            self.process = context.Process(target=_serve, args=(other, self.place), daemon=True)
+            self.folder = tempfile.TemporaryDirectory(ignore_cleanup_errors=True)  # what is killed leaves files there
+            self.process = context.Process(target=_serve, args=(other, self.place, self.folder.name), daemon=True)
             self.process.start()
             other.close()
             self._receive(START_LIMIT, serves=False)
@@ -95,6 +97,7 @@ class Renderer:
             self.process.join()
             with suppress(OSError, AttributeError):  # what it has started, which may tidy up; Windows has no groups
                 os.killpg(self.process.pid, signal.SIGTERM)
+            self.folder.cleanup()
             self.process = None
 
 
@@ -118,8 +121,12 @@ def function_of(place: str):
     return function
 
 
-def _serve(connection, place: str) -> None:
-    """The loop of the process: Gaussians in, picture and gradients out, or a phrase that says what went wrong."""
+def _serve(connection, place: str, folder: str) -> None:
+    """The loop of the process: Gaussians in, picture and gradients out, or a phrase that says what went wrong.
+
+    ``folder``: for temporary files.
+    """
+    os.environ["TMPDIR"] = tempfile.tempdir = folder
     with suppress(AttributeError):
         os.setsid()  # Ctrl-C is for the one that asks
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # what it prints is not the audit's to say
