@@ -61,8 +61,7 @@ def resolve(config: TrainConfig, processes: Processes) -> tuple[TrainConfig, Che
     done = begun.count("iteration") if begun else 0
     if begun and done > end:  # at the end, what is written there is written again
         raise InputError(f"--iterations {end}: expected at least {done}, as in {begun.path}; name a later end.")
-    default = begun.path.parent if begun else model_folder.default_model_path()
-    folder = Path(config.report.model_path or default)
+    folder = Path(config.report.model_path or (begun.path.parent if begun else model_folder.default_model_path()))
     check_folder(config, folder)
     refuse_other_training(folder, begun)  # another, or one that went on from the checkpoint
     say = speaker(quiet)
