@@ -318,7 +318,7 @@ def write_beside(ply: Path, name: str, facts: Mapping[str, object] | None) -> No
     if facts is None:
         (ply.parent / name).unlink(missing_ok=True)
     else:
-        write_text(ply.parent / name, json.dumps(facts, allow_nan=False))
+        write_text(ply.parent / name, json.dumps(facts))  # what reads it refuses numbers that are not finite
 
 
 def read_beside(path: str | Path, iteration: int, name: str, expected: str, parse: Callable[[Any], T]) -> T | None:

@@ -62,33 +62,35 @@ def warn(error: Exception) -> None:
 
 
 def save_model(trainer: Trainer, run: Run) -> Path:
-    """Save the model; if that fails, into the system's folder for temporary files, rather than lose it.
-
-    Refined cameras lie beside it, for viewers, and in the training's folder, there as a COLMAP model for other tools.
-    """
-    own, scene = model_folder.ply_path(run.folder, run.iteration), trainer.scene
-    train, test = trainer.refined(scene.train), trainer.refined(scene.test)
+    """Save the model; if that fails, into the system's folder for temporary files, rather than lose it."""
 
     def save(path: Path) -> None:  # the Gaussians last: without the rest, they would be drawn otherwise
-        if train is not scene.train:
-            model_folder.write_cameras(path.parent, test, train, scene.coordinates)
         behind = trainer.behind.cpu().numpy()
         model_folder.write_environment(path, behind if behind.ndim > 1 else None)
         write_exposures(path, trainer.exposures)
         trainer.save(path)
 
-    path = save_somewhere(own, save, f"iteration_{run.iteration}.ply")
+    path = save_somewhere(model_folder.ply_path(run.folder, run.iteration), save, f"iteration_{run.iteration}.ply")
     try:
-        if train is not scene.train:
-            model_folder.write_cameras(run.folder, test, train, scene.coordinates)
-            cameras = [(view.name, view.original) for view in (*train, *test)]
-            write_colmap(run.folder / "colmap" / "sparse" / "0", cameras, scene.points, scene.colors)
+        _save_cameras(trainer, run.folder, path.parent)
         for files in having(trainer.parts, "files"):
             for name, value in files().items():
                 write_json(run.folder / name, value)
     except InputError as error:
         warn(error)
     return path
+
+
+def _save_cameras(trainer: Trainer, folder: Path, beside: Path) -> None:
+    """If they were refined: beside the model, for viewers, and as a COLMAP model for other tools."""
+    scene, train = trainer.scene, trainer.refined(trainer.scene.train)
+    if train is scene.train:
+        return
+    test = trainer.refined(scene.test)
+    for place in (beside, folder):
+        model_folder.write_cameras(place, test, train, scene.coordinates)
+    cameras = [(view.name, view.original) for view in (*train, *test)]
+    write_colmap(folder / "colmap" / "sparse" / "0", cameras, scene.points, scene.colors)
 
 
 def save_or_warn(trainer: Trainer, run: Run) -> None:
