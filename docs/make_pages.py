@@ -32,8 +32,8 @@ off have a `--no-` form. Those of `warp-splat train` have [a page of their own](
 `warp-splat render`, and `python -m warp_splat.compare` is `warp-splat compare`.
 
 Exit codes: 0; 1 for bad input, of which one sentence says what is wrong, and where `inspect` found an error, `audit` or
-`compare --stability` something that is off; 2 for a value that is no number where one is asked for; 130 for what Ctrl-C
-ended, such as a training, whose model is saved.
+`compare --stability` something that is off; 2 for words that make no command, such as a value that is no number; 130
+for what Ctrl-C ended, such as a training, whose model is saved.
 """
 TRAINING = """# Every flag of a training
 

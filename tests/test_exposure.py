@@ -132,7 +132,7 @@ def test_gaussians_are_saved_with_all_that_they_are_drawn_with(scene, tmp_path, 
     own = ply_path(tmp_path / "model", 3)
     (own.parent / "exposures.json").mkdir(parents=True)
     path = save_model(trainer, run)
-    saved = {"iteration_3.ply", "environment.json", "exposures.json", "cameras.json"}
+    saved = {"point_cloud.ply", "environment.json", "exposures.json", "cameras.json"}
     assert {found.name for found in path.parent.iterdir()} == saved and not own.exists()
     assert (tmp_path / "model" / "cameras.json").is_file() and (tmp_path / "model" / "exposure.json").is_file()
 

@@ -237,9 +237,9 @@ def test_a_full_disk_does_not_lose_the_model(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("warp_splat.gaussians.save_ply_parts", full)
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     assert train(tmp_path / "model", "--iterations", "5", "--antialiasing") == 1
-    (saved,) = tmp_path.glob("warp_splat-*/iteration_5.ply")
+    (saved,) = tmp_path.glob("warp_splat-*/point_cloud/iteration_5/point_cloud.ply")
     assert load_gaussians(saved).antialiased
-    assert str(saved) in capsys.readouterr().err.splitlines()[-1] and len(load_ply(saved).splats.means) == 4500
+    assert str(saved.parent) in capsys.readouterr().err.splitlines()[-1] and len(load_ply(saved).splats.means) == 4500
 
 
 def test_what_is_written_is_told_if_the_disk_is_full_at_the_end(tmp_path, monkeypatch, capsys):
@@ -257,8 +257,8 @@ def test_a_failing_preview_or_save_does_not_end_training(tmp_path, monkeypatch, 
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "spare"))
     (tmp_path / "spare").mkdir()
     assert train(tmp_path, "--save_iterations", "20", "--iterations", "25") == 1
-    saved = sorted(path.name for path in (tmp_path / "spare").glob("*/*.ply"))
-    assert saved == ["iteration_20.ply", "iteration_25.ply"]
+    saved = sorted(path.parent.name for path in (tmp_path / "spare").glob("*/point_cloud/*/point_cloud.ply"))
+    assert saved == ["iteration_20", "iteration_25"]
     errors = capsys.readouterr().err
     assert "preview.png" in errors and "point_cloud" in errors and "Traceback" not in errors
 

@@ -38,7 +38,7 @@ COMMANDS = {
 }
 
 #: Flags whose default, none, is not meant by who gives them an empty text.
-NAMED = "source_path model_path start_checkpoint start_ply config lpips_weights verify video_output out output".split()
+FILLED = "source_path model_path start_checkpoint start_ply config lpips_weights verify video_output out output".split()
 UNUSUAL = re.compile(r"-(inf|[\d.]+e[-+]?\d+)", re.IGNORECASE)  # numbers that argparse takes for flags, without a space
 
 
@@ -103,7 +103,7 @@ def parse(arguments: list[str]) -> Any:
         what = "no such flag" if re.match("-[^0-9]", unknown[0]) else "an argument too many"
         raise InputError(f"{unknown[0]}: {what}; {hint}")
     values = {name: value for name, value in vars(known).items() if name != "command"}
-    for name in NAMED:
+    for name in FILLED:
         if values.get(name) == "":  # mostly a variable of a shell that was never set
             what = "a hash" if name == "verify" else "a path"
             raise InputError(f"--{name}: expected {what}, got an empty one; leave the flag out or name one.")
@@ -158,7 +158,7 @@ def _continued(given: dict) -> dict:
     source = given["start_checkpoint"]
     options = load_options(source)
     for name, reason in FIXED_OPTIONS.items():
-        if given.get(name, (kept := options[name])) != kept:
+        if given.get(name, (kept := options[name])) != kept and os.path.abspath(str(given[name])) != kept:
             kept = "none" if kept == "" else kept
             raise InputError(f"--{name} {given[name]}: expected {kept}, as in {source} ({reason}); leave it out.")
     if given.get("minutes") and not options["minutes"]:

@@ -53,7 +53,8 @@ def audit(config: AuditConfig) -> int:
         try:
             rows.extend(measure(renderer, facts["options"], config.degree, facts["background"]))
         finally:  # Ctrl-C, too, loses no row
-            write_audit(out, facts, rows)
+            if rows:
+                write_audit(out, facts, rows)
     return int(any(row.level in ("warning", "error") for row in rows))
 
 
@@ -90,7 +91,7 @@ def write_audit(out: Path, facts: dict[str, Any], rows: list[SceneRow]) -> None:
     if drawn:
         save_png(out / "worst.png", side_by_side(*drawn[0].pictures))
     off = sum(row.level in ("warning", "error") for row in rows)
-    verdict = f"{off} of {len(rows)} scenes are off; {facts['date']}."
+    verdict = f"{off} of {len(rows)} scenes are off, {len(SCENES) - len(rows)} were not drawn; {facts['date']}."
     write_page(out / "audit.html", f"Audit of {facts['target']}", verdict, findings, pictures)
     print(f"{verdict}\n  page {out / 'audit.html'}")
 

@@ -46,13 +46,13 @@ class Renderer:
     def __init__(self, place: str, limit: float = 60.0):
         self.place, self.limit = place, limit
         self.process: Any = None
+        self.folder = tempfile.TemporaryDirectory(ignore_cleanup_errors=True)  # for what is killed before it tidies up
 
     def start(self) -> None:
         """Start its process, unless it runs. Raises RendererFailed if what draws cannot be imported there."""
         if self.process is None:
             context = multiprocessing.get_context("spawn")
             self.connection, other = context.Pipe()
-            self.folder = tempfile.TemporaryDirectory(ignore_cleanup_errors=True)  # what is killed leaves files there
             self.process = context.Process(target=_serve, args=(other, self.place, self.folder.name), daemon=True)
             self.process.start()
             other.close()
@@ -97,7 +97,6 @@ class Renderer:
             self.process.join()
             with suppress(OSError, AttributeError):  # what it has started, which may tidy up; Windows has no groups
                 os.killpg(self.process.pid, signal.SIGTERM)
-            self.folder.cleanup()
             self.process = None
 
 

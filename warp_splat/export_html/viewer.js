@@ -169,7 +169,7 @@ class Viewer {
     if (canvas.width !== width || canvas.height !== height) {
       [canvas.width, canvas.height] = [width, height];
       const { drawingBufferWidth, drawingBufferHeight } = this.renderer.gl; // a browser may give less
-      if (drawingBufferWidth < width || drawingBufferHeight < height) {
+      if (drawingBufferWidth && (drawingBufferWidth < width || drawingBufferHeight < height)) {
         this.mostPixels = 0.99 * drawingBufferWidth * drawingBufferHeight;
         return this.request();
       }

@@ -15,6 +15,7 @@ import re
 import struct
 import zlib
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -104,9 +105,10 @@ def save_checkpoint(path: str | Path, arrays: Mapping[str, np.ndarray], facts: M
         file.write(struct.pack("<Q", len(encoded)) + encoded)
         for array in arrays.values():
             file.write(array.astype(array.dtype.newbyteorder("<"), copy=False).data)
-    for old in Path(path).parent.glob(f"{Path(path).stem}-*-of-*{Path(path).suffix}"):
-        if old.name not in facts.get(BLOCKS, ()) and old.is_file():
-            old.unlink(missing_ok=True)
+    for old in Path(path).parent.glob(f"{Path(path).stem}-[0-9]*-[0-9]*-of-[0-9]*{Path(path).suffix}"):
+        if old.name not in facts.get(BLOCKS, ()):
+            with suppress(OSError):
+                old.unlink()
 
 
 def load_checkpoint(path: str | Path) -> Checkpoint:

@@ -119,7 +119,7 @@ def save_somewhere(path: Path, save: Callable[[Path], object], name: str = "") -
         Where it is.
 
     Raises:
-        InputError: if that fails, too.
+        InputError, OSError: if that fails, too.
     """
     try:
         save(path)

@@ -24,7 +24,7 @@ COARSEST = 3.0  # voxels that a pixel of a depth may span
 TRUNCATION = 3.0  # voxels
 AGREEING = 0.2  # share of the views asked that see a place where a pixel sees it, or its depth does not count
 TOLERANCE = 0.01  # of the depth, within which that is the same place
-SURE = 3  # of twenty views or more, by which closing goes: what one or two saw wrongly would bore into a solid
+SURE = 3  # views that see a voxel, or half of the usual, by which closing goes: a wrong depth would bore into a solid
 OTHERS = 40  # views that are asked, those that are nearest
 HALF = 1 << 20  # blocks, and voxels from the middle, lie between -HALF and HALF
 
@@ -138,10 +138,8 @@ def code(places: torch.Tensor) -> torch.Tensor:
     return (x << 42) | (y << 21) | z
 
 
-def fused(
-    views: Sequence[Drawn], voxels: torch.Tensor, voxel: float, least: int = 1
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """The distance at each voxel over the truncation, NaN where fewer views see it, [V]; its color [V, 3]."""
+def fused(views: Sequence[Drawn], voxels: torch.Tensor, voxel: float) -> list[torch.Tensor]:
+    """The distance at each voxel over the truncation, NaN where no view sees it, [V]; its color [V, 3]; views [V]."""
     sums, colors = torch.zeros(len(voxels), 2), torch.zeros(len(voxels), 4)
     places = launch.view(voxels, wp.vec3i)
     for view in views:
@@ -150,17 +148,17 @@ def fused(
         pictures = launch.view(view.depth, wp.float32), launch.view(view.image, wp.vec3)
         made = [launch.view(sums, wp.vec2), launch.view(colors, wp.vec4)]
         launch.launch(fuse, len(voxels), [voxel, TRUNCATION * voxel, *pose, lens_of(camera), places, *pictures], made)
-    distance = torch.where(sums[:, 1] >= least, sums[:, 0] / sums[:, 1], torch.nan)
-    return distance, colors[:, :3] / colors[:, 3:].clamp_min(1.0)
+    distance = torch.where(sums[:, 1] > 0, sums[:, 0] / sums[:, 1], torch.nan)
+    return [distance, colors[:, :3] / colors[:, 3:].clamp_min(1.0), sums[:, 1]]
 
 
 def closed(voxels: torch.Tensor, distances: torch.Tensor, colors: torch.Tensor) -> list[torch.Tensor]:
     """Places, distances and colors of those voxels of a whole box that are beside a surface without holes.
 
-    A voxel that no view sees is as the nearest one beside what is seen; the outermost are outside.
+    A voxel whose distance is not known is as the nearest one beside the surface; the outermost are outside.
     """
     shape = tuple(int(size) for size in voxels[-1] - voxels[0] + 1)
-    far = ~(distances.abs() < 1).view(shape).numpy()  # or never seen
+    far = ~(distances.abs() < 1).view(shape).numpy()  # or not known
     nearest = ndimage.distance_transform_edt(far, return_distances=False, return_indices=True)
     nearest = torch.from_numpy(np.ravel_multi_index(tuple(nearest), shape).ravel())
     distances = torch.where(distances.isnan(), distances[nearest], distances).view(shape)
@@ -172,8 +170,9 @@ def closed(voxels: torch.Tensor, distances: torch.Tensor, colors: torch.Tensor) 
 
 def surface_of(voxels: torch.Tensor, views: Sequence[Drawn], voxel: float, watertight: bool = False) -> Surface:
     """Marching cubes in the cells of which all corners are seen: holes stay holes, unless it is to be watertight."""
-    distances, colors = fused(views, voxels, voxel, min(SURE, 1 + len(views) // 10) if watertight else 1)
-    if watertight and (distances.abs() < 1).any():
+    distances, colors, counts = fused(views, voxels, voxel)
+    if watertight and (near := distances.abs() < 1).any():
+        distances[counts < min(SURE, 0.5 * float(counts[near].median()))] = torch.nan
         voxels, distances, colors = closed(voxels, distances, colors)
     known = (~torch.isnan(distances)).nonzero()[:, 0]
     middle = (voxels.amin(0, True) + voxels.amax(0, True)) // 2 if len(voxels) else voxels

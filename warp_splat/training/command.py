@@ -194,7 +194,7 @@ def _finish(trainer: Trainer, run: Run, viewer: TrainingViewer | None, say: open
     if watched and run.iteration >= end:
         trainer.lead(lambda: viewer and viewer.linger())
     if run.saved and run.saved != model_folder.ply_path(run.folder, run.iteration):
-        elsewhere = f"The model is not in {run.folder}, but in {run.saved}; see the warning, move it and what is beside."
+        elsewhere = f"The model is not in {run.folder}, but in {run.saved.parent}; see the warning, and move this."
         tqdm.write(elsewhere, file=sys.stderr)
         return 1
     if run.iteration < end:

@@ -70,7 +70,8 @@ def save_model(trainer: Trainer, run: Run) -> Path:
         write_exposures(path, trainer.exposures)
         trainer.save(path)
 
-    path = save_somewhere(model_folder.ply_path(run.folder, run.iteration), save, f"iteration_{run.iteration}.ply")
+    own = model_folder.ply_path("", run.iteration)
+    path = save_somewhere(run.folder / own, save, str(own))
     try:
         _save_cameras(trainer, run.folder, path.parent)
         for files in having(trainer.parts, "files"):
