@@ -108,10 +108,8 @@ def put_among_meshes(
         alike = byte_of(rgb[0], 0) | byte_of(rgb[1], 1) | byte_of(rgb[2], 2)
         color_out[v, y, x] = alike | byte_of(1.0, 3)
     if depth_out.shape[0] > 0:
-        seen = depth[v, y, x]
-        if far > 0.0:
-            seen = alpha[v, y, x] * depth[v, y, x] + through * far
-        depth_out[v, y, x] = seen
+        among = alpha[v, y, x] * depth[v, y, x] + through * far
+        depth_out[v, y, x] = wp.where(far > 0.0, among, depth[v, y, x])
 
 
 @wp.kernel
