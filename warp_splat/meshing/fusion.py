@@ -24,7 +24,7 @@ COARSEST = 3.0  # voxels that a pixel of a depth may span
 TRUNCATION = 3.0  # voxels
 AGREEING = 0.2  # share of the views asked that see a place where a pixel sees it, or its depth does not count
 TOLERANCE = 0.01  # of the depth, within which that is the same place
-SURE = 3  # views that see a voxel, or half of the usual, by which closing goes: a wrong depth would bore into a solid
+SURE = 3  # views of a voxel, or one less than usual, by which closing goes: a wrong depth would bore into a solid
 OTHERS = 40  # views that are asked, those that are nearest
 HALF = 1 << 20  # blocks, and voxels from the middle, lie between -HALF and HALF
 
@@ -172,7 +172,7 @@ def surface_of(voxels: torch.Tensor, views: Sequence[Drawn], voxel: float, water
     """Marching cubes in the cells of which all corners are seen: holes stay holes, unless it is to be watertight."""
     distances, colors, counts = fused(views, voxels, voxel)
     if watertight and (near := distances.abs() < 1).any():
-        distances[counts < min(SURE, 0.5 * float(counts[near].median()))] = torch.nan
+        distances[counts < min(SURE, float(counts[near].median()) - 1)] = torch.nan
         voxels, distances, colors = closed(voxels, distances, colors)
     known = (~torch.isnan(distances)).nonzero()[:, 0]
     middle = (voxels.amin(0, True) + voxels.amax(0, True)) // 2 if len(voxels) else voxels
