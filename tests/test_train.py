@@ -232,7 +232,7 @@ def test_a_full_disk_does_not_lose_the_model(tmp_path, monkeypatch, capsys):
     """The save fails; the model goes to the folder for temporary files instead."""
 
     def full(path, *arrays, **options):
-        (no_space if "point_cloud" in str(path) else save_ply_parts)(path, *arrays, **options)
+        (no_space if tmp_path / "model" in path.parents else save_ply_parts)(path, *arrays, **options)
 
     monkeypatch.setattr("warp_splat.gaussians.save_ply_parts", full)
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))

@@ -51,7 +51,7 @@ def test_a_frame_with_a_focal_length_of_its_own_takes_none_of_the_file(tmp_path)
     own = [{}, {"camera_angle_x": 1.0}, {"fl_x": 50.0}, {"fl_y": 50.0}, {"fl_x": None, "latlong": None}]
     own.append({"camera_angle_y": 0.5})  # beside a focal length of x, that of y counts
     names = [f"{name}.png" for name in "abcdef"]
-    scene, _ = load(write_transforms(tmp_path, names, frame=lambda index: own[index], p1=None, camera_angle_x=None))
+    scene, _ = load(write_transforms(tmp_path, names, frame=lambda index: own[index], p1=None, train_filenames=None))
     found = [value for view in scene.train for value in (view.camera.fx, view.camera.fy)]
     assert found == pytest.approx([40, 44, *[0.5 * WIDTH / np.tan(0.5)] * 2, 50, 50, 40, 50, 40, 44, 40, 44])
 

@@ -105,8 +105,8 @@ def save_checkpoint(path: str | Path, arrays: Mapping[str, np.ndarray], facts: M
         file.write(struct.pack("<Q", len(encoded)) + encoded)
         for array in arrays.values():
             file.write(array.astype(array.dtype.newbyteorder("<"), copy=False).data)
-    for old in Path(path).parent.glob(f"{Path(path).stem}-[0-9]*-[0-9]*-of-[0-9]*{Path(path).suffix}"):
-        if old.name not in facts.get(BLOCKS, ()):
+    for old in Path(path).parent.glob(f"{Path(path).stem}-*-of-*{Path(path).suffix}"):
+        if old.name not in facts.get(BLOCKS, ()) and re.fullmatch(r"-\d+-\d+-of-\d+", old.stem[len(Path(path).stem) :]):
             with suppress(OSError):
                 old.unlink()
 

@@ -303,7 +303,7 @@ def read_environment(path: str | Path, iteration: int) -> np.ndarray | None:
 
     def parse(facts: dict) -> np.ndarray:
         if (harmonics := np.array(facts["harmonics"], np.float32)).shape != (16, 3) or not np.isfinite(harmonics).all():
-            raise Unexpected(f"numbers of shape {list(harmonics.shape)}, or such that are not finite")
+            raise Unexpected(f"shape {list(harmonics.shape)}, or numbers that are not finite, as by a large --sky_lr")
         return harmonics
 
     return read_beside(path, iteration, ENVIRONMENT, "harmonics as training writes them", parse)

@@ -122,7 +122,7 @@ def _split(
 
 
 def _names(content: dict[str, Any], key: str, path: Path) -> set[str]:
-    names = content.get(key, [])
+    names = [] if content.get(key) is None else content[key]
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise _wrong(path, f"{key} as a list of names", names)
     return {Path(name).as_posix() for name in names}
