@@ -108,6 +108,11 @@ def modules() -> dict[str, wp.Module]:
     return found
 
 
+def versions_of() -> dict[str, str]:
+    """What a module's machine code depends on, by its name: a change of Warp, of its source or options changes it."""
+    return {name: f"{wp.config.version}, {module.hash_module().hex()}" for name, module in modules().items()}
+
+
 def cuobjdump() -> str | None:
     """NVIDIA's disassembler, which comes with triton, which comes with torch on Linux; None elsewhere."""
     places = (Path(folder) / "triton/backends/nvidia/bin/cuobjdump" for folder in sys.path)
@@ -181,7 +186,7 @@ def main() -> None:
     headers = (*headers, *(f"sm_{arch} %" for arch in LIMITS))
     note = "The most of any architecture; occupancy in percent. Loop: instructions of the longest that holds no other."
     note += f" {versions()}."
-    write_table("cubins", arguments.out, headers, rows, note, {"records": records})
+    write_table("cubins", arguments.out, headers, rows, note, {"records": records, "versions": versions_of()})
 
 
 if __name__ == "__main__":
