@@ -38,8 +38,8 @@ NOISE = 0.2  # dB, of the mean of four seeds; a seed differs from another, and f
 def measure_training(device: str, iterations: int | None) -> Iterator[tuple[list, float]]:
     """The embedded scene, densification and all: rows, and their PSNR in dB.
 
-    With photographs on the device, and in page-locked memory of the host; then other seeds, all at once, or one in a
-    dry run of so many ``iterations``, where photographs are small.
+    With photographs on the device, and in page-locked memory of the host; then other seeds, all at once. In a dry run
+    of so many ``iterations`` only one of these, of small photographs.
     """
     more = ["--iterations", f"{iterations}", "-r", "8"] if iterations else []
 
@@ -51,7 +51,8 @@ def measure_training(device: str, iterations: int | None) -> Iterator[tuple[list
         quality = [f"{results['PSNR']:.2f}", f"{results['SSIM']:.4f}", results["gaussians"]]
         return [where, seed, results["iterations"], took, *quality], results["PSNR"]
 
-    yield from (train(where, 0) for where in dict.fromkeys((device, "cpu")))
+    if not iterations:
+        yield from (train(where, 0) for where in (device, "cpu"))
     with ThreadPoolExecutor() as pool:
         yield from pool.map(partial(train, device), SEEDS[:1] if iterations else SEEDS)
 

@@ -15,6 +15,7 @@ from commands import ROOT, SCENE, python
 from hostile import refusal
 from scene_files import write_colmap
 
+from warp_splat.cli import main
 from warp_splat.errors import InputError
 from warp_splat.formats.checkpoint import load_own, save_checkpoint, save_in_blocks
 from warp_splat.formats.curve import along_curve, keys_of
@@ -119,9 +120,12 @@ def test_pieces_are_sorted_and_drawn_for_as_those_of_the_whole(count, monkeypatc
 
 def train(folder, count, options):
     """The model of a training by ``count`` processes, of which each holds a block; of one, that holds it all."""
-    torchrun = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", count] if count > 1 else []
-    sharded = ["--shard", "--viewer"] if count > 1 else ["--no-shard"]
-    python(*torchrun, ROOT / "train.py", "-m", folder, *options.split(), *sharded)
+    command = ["train", "-m", str(folder), *options.split()]
+    if count > 1:
+        torchrun = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", count, ROOT / "train.py"]
+        python(*torchrun, *command[1:], "--shard", "--viewer")
+    else:
+        assert main([*command, "--no-shard"]) == 0
     (model,) = folder.glob("point_cloud/*/point_cloud.ply")
     return model.read_bytes()
 
@@ -129,7 +133,8 @@ def train(folder, count, options):
 @pytest.mark.parametrize(
     ("growth", "counts", "iterations"),
     [
-        pytest.param("reference", [3], 80, marks=pytest.mark.slow),
+        pytest.param("reference", [2], 80, marks=pytest.mark.slow),
+        pytest.param("reference", [3], 80, marks=pytest.mark.long),
         pytest.param("mcmc", [2], 80, marks=pytest.mark.long),
         pytest.param("budget", [3], 80, marks=pytest.mark.long),
         *(pytest.param(growth, [2, 3, 4], 800, marks=pytest.mark.long) for growth in GROWTHS),
