@@ -1,5 +1,6 @@
 """Nothing is lost: a run that stops and resumes ends in the same bytes, kill -9 leaves a loadable file."""
 
+import itertools
 import json
 import multiprocessing
 import os
@@ -14,7 +15,7 @@ import numpy as np
 import pytest
 import safetensors.numpy
 import torch
-from commands import ROOT, SCENE, SHORT, interrupt, no_space, started, train
+from commands import ROOT, SCENE, SHORT, interrupt, no_space, train
 from hostile import refusal
 from scene_files import pose, write_colmap
 from splat_files import some_splats
@@ -318,27 +319,41 @@ def test_two_processes_stop_and_resume(tmp_path):
     assert ply_path(tmp_path / "parts", 65).is_file()
 
 
-WRITER = """
-import itertools, sys, numpy as np
-from warp_splat.formats.checkpoint import save_checkpoint
-for count in itertools.count():
-    save_checkpoint(sys.argv[1], {"a": np.full(500_000, count, np.float32)}, {"count": count})
-    print(count, flush=True)
-"""
+#: Processes that have loaded torch are forked.
+forked = pytest.mark.skipif(not hasattr(os, "fork"), reason="there are no forks")
 
 
+def forked_process(target, *arguments):
+    """One that runs, from one that has loaded what a training needs."""
+    processes = multiprocessing.get_context("forkserver")
+    processes.set_forkserver_preload(["warp_splat.training.command"])
+    process = processes.Process(target=target, args=arguments)
+    process.start()
+    return process
+
+
+def keep_writing(path, told):
+    for count in itertools.count():
+        save_checkpoint(path, {"a": np.full(500_000, count, np.float32)}, {"count": count})
+        told.send(count)
+
+
+@forked
 @pytest.mark.parametrize("moments", [5, pytest.param(50, marks=pytest.mark.long)])
 def test_a_writer_that_is_killed_leaves_a_whole_checkpoint(moments, tmp_path):
     path, moment = tmp_path / LAST, random.Random(0)
     for _ in range(moments):
-        process = started("-c", WRITER, path)
-        assert process.stdout.readline() == "0\n"
+        heard, told = multiprocessing.Pipe(duplex=False)
+        process = forked_process(keep_writing, path, told)
+        last = heard.recv()
         time.sleep(moment.uniform(0, 0.1))
         process.kill()
-        said = [0, *map(int, process.communicate()[0].split())]
+        process.join()
+        while heard.poll():
+            last = heard.recv()
         checkpoint = load_checkpoint(path)
         count = checkpoint.count("count")
-        assert count in (said[-1], said[-1] + 1) and (checkpoint.arrays["a"] == count).all()
+        assert count in (last, last + 1) and (checkpoint.arrays["a"] == count).all()
 
 
 def run_main(arguments):
@@ -349,19 +364,16 @@ def run_main(arguments):
     ("most", "iterations"),
     [pytest.param(4, 60, marks=pytest.mark.slow), pytest.param(50, 300, marks=pytest.mark.long)],
 )
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="processes that have loaded torch are forked")
+@forked
 def test_a_training_that_is_killed_again_and_again_ends_in_the_same_bytes(most, iterations, tmp_path):
     """Killed at random moments, from first line to last picture; a checkpoint is written after every step."""
     options = [*SHORT, "--iterations", str(iterations), "--checkpoint_interval", "0.00001"]
     assert train(tmp_path / "whole", *options) == 0
-    processes = multiprocessing.get_context("forkserver")
-    processes.set_forkserver_preload(["warp_splat.training.command"])
     moment, kills, runs, reached = random.Random(0), 0, 0, 0
     while True:
         folder = tmp_path / f"model{runs}"
         start = ["--resume", folder] if (folder / LAST).exists() else ["-s", SCENE, "-m", folder, *options]
-        process = processes.Process(target=run_main, args=(["train", *map(str, start)],))
-        process.start()
+        process = forked_process(run_main, ["train", *map(str, start)])
         process.join(moment.uniform(0.0, 2.5) if kills < most else None)
         if process.exitcode is None:
             process.kill()

@@ -34,7 +34,9 @@ def test_resources(arch):
         for record in found:
             place = record["module"], record["kernel"]
             seen.add(place)
-            assert record["stack"] == 0 or ((place[1], arch) in SPILLING and record["stack"] <= before[place]["stack"]), place
+            assert record["stack"] == 0 or (
+                (place[1], arch) in SPILLING and record["stack"] <= before[place]["stack"]
+            ), place
             for key in KEYS:
                 assert record[key] <= before[place][key], (place, key, "rerun benchmarks/cubins.py if that is wanted")
     assert seen == set(before)
