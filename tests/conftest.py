@@ -18,6 +18,7 @@ from warp_splat.cli import main
 from warp_splat.config import RasterOptions
 from warp_splat.evaluation import report
 from warp_splat.export_html import command, pack
+from warp_splat.inspect import page
 from warp_splat.kernels import ssim
 from warp_splat.kernels.cpu.adjoint import make_reverse
 from warp_splat.kernels.cpu.blend import make_blend
@@ -32,7 +33,9 @@ from warp_splat.scene import load_scene
 from warp_splat.scene.embedded import embedded_scene
 
 pool.SMALLEST_SLICE = 256  # so that threads share small scenes, too
-report.DPI = 50  # so that the pictures of a training take a third of the time
+report.DPI = page.PAGE_DPI = 50  # so that pictures take a third of the time
+new_figure = report.new_figure
+report.new_figure = lambda width, height, layout=None: new_figure(width, height)  # finding room takes the most of it
 # Tests start dozens of processes: what one has compiled of torch serves the next.
 sys.dont_write_bytecode = False
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
