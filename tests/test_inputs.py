@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+import OpenImageIO as oiio
 import pytest
 import torch
 from hostile import refusal
@@ -168,6 +169,46 @@ def test_floats_are_linear_light(tmp_path, monkeypatch):
         loss = trainer.differentiate(iteration)
         trainer.update(iteration)
     assert loss.isfinite() and all(tensor.isfinite().all() for tensor in trainer.model.parameters.values())
+
+
+def write_exr(path, channels, size=(WIDTH, HEIGHT)):
+    """An EXR of so many pixels, whose picture has those of the others; a channel is 1/8, 2/8, ..., or no number."""
+    spec, file = oiio.ImageSpec(*size, len(channels), oiio.FLOAT), oiio.ImageOutput.create("a.exr")
+    spec.channelnames, spec.full_width, spec.full_height = channels, WIDTH, HEIGHT
+    values = [{"Z": 1e30, "A": 1.0}.get(name[-1], (1 + place) / 8) for place, name in enumerate(channels)]
+    pixels = np.tile(np.float32(values), (size[1], size[0], 1))
+    assert file.open(str(path), spec) and file.write_image(pixels) and file.close()
+
+
+@pytest.mark.parametrize(
+    ("channels", "found"),
+    [
+        ("R G B Z", [1, 2, 3]),  # renders bring depths along, where nothing is 1e30
+        ("Z L.R L.G L.B L.A", [2, 3, 4]),
+        ("Albedo.R Albedo.G Albedo.B R G B A", [4, 5, 6]),
+        ("Y", [1, 1, 1]),
+        ("Y A", [1, 1, 1]),
+        (
+            "Albedo.R Albedo.G Albedo.B L.R L.G L.B L.A",
+            r"channels Albedo\.R, Albedo\.G, Albedo\.B and 4 more instead of",
+        ),
+        ("Z", "channels Z instead of R, G, B"),
+        ("R G", "channels R, G instead of R, G, B"),
+    ],
+)
+def test_colors_of_an_exr_are_found_by_their_names(tmp_path, channels, found):
+    root = write_colmap(tmp_path, ["a.exr"])
+    write_exr(root / "images" / "a.exr", channels.split())
+    if isinstance(found, str):
+        refusal(lambda: load(root), match=found)
+    else:
+        assert (load(root)[0].train[0].image == np.float32(found) / 8).all()
+
+
+def test_an_exr_with_fewer_pixels_than_its_picture_is_refused(tmp_path):
+    root = write_colmap(tmp_path, ["a.exr"])
+    write_exr(root / "images" / "a.exr", ["R", "G", "B"], (WIDTH // 2, HEIGHT // 2))
+    refusal(lambda: load(root), f"only {WIDTH // 2} x {HEIGHT // 2} of {WIDTH} x {HEIGHT} pixels")
 
 
 def test_one_kind_of_light_in_a_scene(tmp_path):

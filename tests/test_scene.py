@@ -4,7 +4,6 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
-import OpenImageIO as oiio
 import pycolmap
 import pytest
 from commands import FOX, python
@@ -165,16 +164,6 @@ def test_undistorted_image_is_the_ideal_pinhole_image(tmp_path, model, distort, 
     scene, lines = load(root, resolution=resolution)
     check_ideal(scene.train[0], 0.65 if resolution > 1 else 0.52)  # halved, it goes through two filters
     assert any(model in line for line in lines)
-
-
-def test_only_color_and_alpha_of_a_file_count(tmp_path):
-    """Renders bring depths along, where nothing is 1e30."""
-    root, spec = write_colmap(tmp_path, ["a.exr"]), oiio.ImageSpec(WIDTH, HEIGHT, 4, oiio.FLOAT)
-    spec.channelnames = ["R", "G", "B", "Z"]
-    pixels = np.dstack([texture() / np.float32(255), np.full((HEIGHT, WIDTH), 1e30, np.float32)])
-    file = oiio.ImageOutput.create("a.exr")
-    assert file.open(str(root / "images" / "a.exr"), spec) and file.write_image(pixels) and file.close()
-    np.testing.assert_array_equal(load(root)[0].train[0].image, pixels[..., :3])
 
 
 def test_a_lamp_stays_where_it_is_when_linear_light_is_undistorted(tmp_path):
