@@ -114,7 +114,11 @@ def spoil(old, new, name=BLOCK):
 #: What a merge finds: the numbers of the blocks, and what is wrong with them.
 WRONG = {
     "found none": ((), None),
-    "found a training": ((0, 1), lambda folder: (folder / LAST).touch()),
+    "found another model": ((0, 1), lambda folder: (folder / LAST).touch()),
+    "trainings by --block, found another model": (
+        (0, 1),
+        lambda folder: shutil.copytree(folder / "1" / "point_cloud", folder / "point_cloud"),
+    ),
     "found 0 of block 2/2": ((0,), None),
     "found 2 of block 1/2, 0 of block 2/2": ((0, "00"), None),
     "expected the number of blocks of": ((0, 1), spoil('"cells": [', '"cells": [[[0, 0, 0], [1, 1, 1]], ')),
@@ -138,6 +142,21 @@ def test_a_merge_says_what_is_wrong(found, trained, tmp_path, fails):
     if spoiled:
         spoiled(tmp_path)
     assert found in fails("merge", tmp_path)
+
+
+def test_no_gaussians_are_merged_without_what_they_are_drawn_with(trained, tmp_path, fails):
+    put(trained, tmp_path, 0, 1)
+    (tmp_path / "cfg_args").mkdir()
+    assert "cfg_args" in fails("merge", tmp_path)
+    assert not list(tmp_path.glob("point_cloud/*/*"))
+
+
+def test_blocks_are_not_trained_where_another_model_is(trained, tmp_path, fails):
+    """Also one without a checkpoint."""
+    ply = shutil.copytree(trained / "point_cloud", tmp_path / "point_cloud")
+    words = "train", "-s", SCENE, "-m", tmp_path, *SHORT, "--blocks", "2"
+    assert "it already holds a training, or another model; choose another with -m" in fails(*words)
+    assert list(ply.glob("*/*.ply"))
 
 
 def test_all_blocks_by_one_command_are_those_of_many(trained, tmp_path, capsys, monkeypatch, fails):

@@ -125,12 +125,13 @@ def test_the_folder_has_the_maps_in_the_layout_of_the_reference(kind, scene, tmp
     torch.testing.assert_close(trainer.parts[0].image(image, None, SimpleNamespace(view=view)), expected)
 
 
-def test_gaussians_are_saved_with_all_that_they_are_drawn_with(scene, tmp_path, monkeypatch):
+@pytest.mark.parametrize("name", ["exposures.json", "cameras.json"])
+def test_gaussians_are_saved_with_all_that_they_are_drawn_with(scene, tmp_path, monkeypatch, name):
     """Elsewhere, if one of these files cannot be written."""
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     trainer, run = stepped(scene, tmp_path / "model", 3, parts="sky,exposure,pose")
     own = ply_path(tmp_path / "model", 3)
-    (own.parent / "exposures.json").mkdir(parents=True)
+    (own.parent / name).mkdir(parents=True)
     path = save_model(trainer, run)
     saved = {"point_cloud.ply", "environment.json", "exposures.json", "cameras.json"}
     assert {found.name for found in path.parent.iterdir()} == saved and not own.exists()

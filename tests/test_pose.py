@@ -1,6 +1,7 @@
 """Refined poses: what moves and what stays, the verdict, the same bytes after a resume, the files that know them."""
 
 import json
+import shutil
 from dataclasses import replace
 
 import cameras as made_cameras
@@ -17,13 +18,15 @@ from warp_splat.cli import main
 from warp_splat.evaluation import alignment
 from warp_splat.evaluation.alignment import find_pose
 from warp_splat.formats.colmap_text import write_colmap as write_model
-from warp_splat.formats.model_folder import read_cameras
+from warp_splat.formats.model_folder import ply_path, read_cameras
+from warp_splat.formats.ply import load_ply
 from warp_splat.lenses import Lens
 from warp_splat.raster.api import rasterize
 from warp_splat.rendering.finished import Finished
 from warp_splat.scene import load_scene
 from warp_splat.scene.types import Decoded, View, visible
 from warp_splat.training.parts.pose import MOST, Pose, factors, gauge, inverses, orthonormal, pose_error, sensitivity
+from warp_splat.training.record import save_model
 from warp_splat.viewer.command import _find_scene
 
 ALL = {"parts": "pose", "pose_from_iter": 1, "pose_intrinsics": "all"}
@@ -240,6 +243,20 @@ def test_lenses_are_written_as_colmap_has_them(model, coefficients, scene, tmp_p
     rays = np.random.default_rng(0).normal(size=(50, 3)) * 0.2 + [0, 0, 1]
     np.testing.assert_allclose(found.original.lens.distorted(rays), camera.lens.distorted(rays), atol=1e-12)
     assert found.original.fx / found.original.width == pytest.approx(camera.fx / camera.width, rel=1e-9)
+
+
+def test_where_cameras_are_refined_no_more_none_are_left(trained, tmp_path):
+    folder = shutil.copytree(trained, tmp_path / "model")
+    assert (ply_path(folder, 24).parent / "cameras.json").exists()
+    assert main(["train", "--resume", str(folder), "--parts", ""]) == 0
+    assert not (ply_path(folder, 24).parent / "cameras.json").exists()
+
+
+def test_gaussians_are_saved_though_cameras_are_not_finite(scene, tmp_path, capsys):
+    trainer, run = stepped(scene, tmp_path, 3, **ALL)
+    trainer.parts[0].moves.data[:] = torch.nan
+    assert save_model(trainer, run) == ply_path(tmp_path, 3)
+    assert load_ply(ply_path(tmp_path, 3)) and "warning: " in capsys.readouterr().err
 
 
 def test_a_scene_that_changed_is_refused(trained, tmp_path, fails):

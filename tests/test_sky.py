@@ -9,6 +9,7 @@ from commands import SCENE
 from common import picture_of
 from make_faults import beyond, make_faulty, sky_light
 from scipy.spatial.transform import Rotation
+from splat_files import some_file
 from trainings import begin, stepped, steps
 
 from warp_splat.camera import Camera
@@ -16,6 +17,7 @@ from warp_splat.cli import main
 from warp_splat.color import to_srgb
 from warp_splat.compare.oracle import sh_basis
 from warp_splat.errors import InputError
+from warp_splat.formats.exchange import save_gaussians
 from warp_splat.formats.model_folder import ply_path, read_environment, write_cfg_args
 from warp_splat.gaussians import GaussianModel
 from warp_splat.lenses import Lens
@@ -92,11 +94,14 @@ def test_formats_without_it_say_so(trained, tmp_path, capsys):
 
 
 @pytest.mark.parametrize("text", ["{", "[]", '{"harmonics": [[1, 2, 3]]}', '{"harmonics": [["a"]]}'])
-def test_a_damaged_file_is_one_sentence(text, tmp_path):
+def test_a_damaged_file_is_one_sentence(text, tmp_path, fails):
     ply_path(tmp_path, 3).parent.mkdir(parents=True)
     (ply_path(tmp_path, 3).parent / "environment.json").write_text(text)
+    save_gaussians(ply_path(tmp_path, 3), some_file(9))
     with pytest.raises(InputError, match=r"environment\.json: expected harmonics as training writes them, found"):
         read_environment(tmp_path, 3)
+    assert "environment.json" in fails("export-html", tmp_path, tmp_path / "a.html")
+    assert not (tmp_path / "a.html").exists()
 
 
 def test_what_is_cut_out_has_no_sky(scene, tmp_path):

@@ -52,14 +52,15 @@ def export_html(config: ExportHtmlConfig) -> int:
         "LINEAR": bool(trained.get("linear_light")),
         "BACKGROUND": float(bool(trained.get("white_background"))),
     }
+    behind, exposures = (read(config.model, iteration) for read in (model_folder.read_environment, read_exposures))
     page = make_page(Path(config.model).resolve().name, kept, cameras or [("start", _start(kept))], options)
     write_text(path, page)
     size, total = len(page) / 1e6, len(splats.means)
     print(f"{path}: {len(kept.means)} of {total} Gaussians, {len(cameras)} cameras, {size:.1f} MB; for any browser")
-    if model_folder.read_environment(config.model, iteration) is not None:
-        behind = "white" if options["BACKGROUND"] else "black"
-        print(f"  The page does not have what was learned behind the Gaussians (--parts sky): it is {behind} there.")
-    if read_exposures(config.model, iteration):
+    if behind is not None:
+        color = "white" if options["BACKGROUND"] else "black"
+        print(f"  The page does not have what was learned behind the Gaussians (--parts sky): it is {color} there.")
+    if exposures:
         print("  The page shows the mean exposure, not that of each photograph (--parts exposure).")
     if trained.get("projection") == "unscented":
         print("  The page draws by the affine projection, not by the unscented one of the training: it differs.")

@@ -17,7 +17,7 @@ from warp_splat.errors import InputError
 from warp_splat.formats.coordinates import read_coordinates, write_coordinates
 from warp_splat.formats.exchange import save_gaussians
 from warp_splat.formats.files import read_json, whole_number, write_json
-from warp_splat.formats.model_folder import CAMERAS, open_model, ply_path, read_cfg_args, write_cfg_args
+from warp_splat.formats.model_folder import AS_SAVED, CAMERAS, open_model, ply_path, read_cfg_args, write_cfg_args
 from warp_splat.formats.ply import load_points, save_points
 from warp_splat.formats.splats import concatenated
 from warp_splat.scene.types import visible
@@ -100,6 +100,18 @@ def _block_of_json(facts: dict) -> Block:
     return Block(whole_number(facts["number"], "block", len(cells) - 1), cells)
 
 
+def holds_another(folder: Path) -> bool:
+    """Whether there is a training in a folder, or a model that was not merged of blocks.
+
+    Raises:
+        InputError: if its cfg_args is damaged.
+    """
+    from warp_splat.formats.checkpoint import LAST  # noqa: PLC0415 - torch takes seconds to load
+
+    merged = (folder / "cfg_args").exists() and read_cfg_args(folder).get("blocks")
+    return (folder / LAST).exists() or (any(folder.glob(AS_SAVED)) and not merged)
+
+
 def merge_blocks(config: MergeConfig) -> int:
     """Make one model of trainings of all blocks, as ``config`` says; returns the process's exit code.
 
@@ -108,13 +120,12 @@ def merge_blocks(config: MergeConfig) -> int:
     Raises:
         InputError: if a block has not been trained to its end, or is there twice; if one is of another cut or kind.
     """
-    from warp_splat.formats.checkpoint import LAST  # noqa: PLC0415 - torch takes seconds to load
-    from warp_splat.formats.curve import arranged  # noqa: PLC0415 - likewise
+    from warp_splat.formats.curve import arranged  # noqa: PLC0415 - torch takes seconds to load
 
     folder = Path(config.folder)
     places = sorted(path.parent for path in folder.glob(f"*/{BLOCK}"))
-    if (folder / LAST).exists() or not places:
-        found = "a training" if places else "none" if folder.is_dir() else "no such folder"
+    if (another := holds_another(folder)) or not places:
+        found = "another model" if another else "none" if folder.is_dir() else "no such folder"
         raise InputError(f"{folder}: expected only folders of ended trainings by --block, found {found}.")
     blocks = [read_json(place / BLOCK, "a block as training writes it", _block_of_json) for place in places]
     models = [open_model(place)[:2] for place in places]
@@ -138,12 +149,12 @@ def merge_blocks(config: MergeConfig) -> int:
         named = lambda entries: {str(entry["img_name"]): entry for entry in entries}  # noqa: E731
         cameras |= read_json(place / CAMERAS, "cameras as training writes them", named)
     merged = models[0][1]._replace(splats=arranged(concatenated(splats)), linear=False)  # cfg_args says it
-    save_gaussians(path, merged)
-    for old in {*folder.glob("point_cloud/*/point_cloud.ply")} - {path}:  # merged before, from blocks of other lengths
-        old.unlink()
     save_points(folder / "input.ply", *map(np.concatenate, zip(*clouds, strict=True)))
     write_json(folder / CAMERAS, [{**cameras[name], "id": index} for index, name in enumerate(sorted(cameras))])
     write_coordinates(folder, read_coordinates(places[0]))
-    write_cfg_args(folder, {**trained[0], "block": "", "model_path": str(folder)})
+    write_cfg_args(folder, {**trained[0], "block": "", "blocks": count, "model_path": str(folder)})
+    save_gaussians(path, merged)  # last: without the rest, they would be drawn otherwise
+    for old in {*folder.glob(AS_SAVED)} - {path}:  # merged before, from blocks of other lengths
+        old.unlink()
     print(f"{path}: {len(merged.splats.means)} Gaussians of {count} blocks")
     return 0

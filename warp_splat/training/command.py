@@ -23,7 +23,7 @@ from warp_splat.runtime.devices import memory_explained
 from warp_splat.runtime.distributed import GroupError, Processes, join
 from warp_splat.runtime.interrupts import interruptible
 from warp_splat.runtime.shards import Shards
-from warp_splat.scene.blocks import BLOCK, merge_blocks
+from warp_splat.scene.blocks import BLOCK, holds_another, merge_blocks
 from warp_splat.scene.start import load_start
 from warp_splat.training import memory, opening
 from warp_splat.training.deadline import plan_training
@@ -66,8 +66,8 @@ def _train_blocks(config: TrainConfig) -> int:
     folder, count = Path(config.report.model_path or model_folder.default_model_path()), config.data.blocks
     if int(os.environ.get("WORLD_SIZE", "1")) > 1:
         raise InputError(f"--blocks: expected one process; let torchrun train one of them (--block 1/{count}).")
-    if (folder / LAST).exists():
-        raise InputError(f"{folder}: it already holds a training; choose another with -m.")
+    if holds_another(folder):
+        raise InputError(f"{folder}: it already holds a training, or another model; choose another with -m.")
     opening.check_folder(config, folder)
     say, numbers = opening.speaker(config.report.quiet), range(1, count + 1)
     for number in numbers:

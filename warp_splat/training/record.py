@@ -24,6 +24,7 @@ from warp_splat.formats.files import save_somewhere, write_json
 from warp_splat.runtime.devices import peak_memory
 from warp_splat.runtime.distributed import Processes
 from warp_splat.scene.blocks import write_block
+from warp_splat.scene.types import View
 from warp_splat.text import format_table
 from warp_splat.training.config_file import OF_ONE_RUN
 from warp_splat.training.plan import as_flags
@@ -63,17 +64,26 @@ def warn(error: Exception) -> None:
 
 def save_model(trainer: Trainer, run: Run) -> Path:
     """Save the model; if that fails, into the system's folder for temporary files, rather than lose it."""
+    scene, refined = trainer.scene, _refined(trainer)
 
     def save(path: Path) -> None:  # the Gaussians last: without the rest, they would be drawn otherwise
         behind = trainer.behind.cpu().numpy()
         model_folder.write_environment(path, behind if behind.ndim > 1 else None)
         write_exposures(path, trainer.exposures)
+        model_folder.write_beside(path, model_folder.DRAWN, None)  # by this training's
+        if refined:
+            model_folder.write_cameras(path.parent, *refined, scene.coordinates)
+        else:
+            (path.parent / model_folder.CAMERAS).unlink(missing_ok=True)
         trainer.save(path)
 
     own = model_folder.ply_path("", run.iteration)
     path = save_somewhere(run.folder / own, save, str(own))
     try:
-        _save_cameras(trainer, run.folder, path.parent)
+        if refined:  # for viewers, and for other tools
+            model_folder.write_cameras(run.folder, *refined, scene.coordinates)
+            cameras = [(view.name, view.original) for views in refined[::-1] for view in views]
+            write_colmap(run.folder / "colmap" / "sparse" / "0", cameras, scene.points, scene.colors)
         for files in having(trainer.parts, "files"):
             for name, value in files().items():
                 write_json(run.folder / name, value)
@@ -82,16 +92,15 @@ def save_model(trainer: Trainer, run: Run) -> Path:
     return path
 
 
-def _save_cameras(trainer: Trainer, folder: Path, beside: Path) -> None:
-    """If they were refined: beside the model, for viewers, and as a COLMAP model for other tools."""
-    scene, train = trainer.scene, trainer.refined(trainer.scene.train)
-    if train is scene.train:
-        return
-    test = trainer.refined(scene.test)
-    for place in (beside, folder):
-        model_folder.write_cameras(place, test, train, scene.coordinates)
-    cameras = [(view.name, view.original) for view in (*train, *test)]
-    write_colmap(folder / "colmap" / "sparse" / "0", cameras, scene.points, scene.colors)
+def _refined(trainer: Trainer) -> tuple[list[View], list[View]] | None:
+    """Test and training views with the cameras that were learned; None if none were, or they are not finite."""
+    scene = trainer.scene
+    try:
+        test, train = trainer.refined(scene.test), trainer.refined(scene.train)
+    except (ValueError, ArithmeticError) as error:
+        warn(error)
+        return None
+    return None if train is scene.train else (test, train)
 
 
 def save_or_warn(trainer: Trainer, run: Run) -> None:
