@@ -1,6 +1,7 @@
 """Commands of ours, in this process and in others, and how they end."""
 
 import io
+import multiprocessing
 import os
 import re
 import signal
@@ -51,6 +52,15 @@ def started(*words, **pipes):
     """A process of Python that runs, with pipes for what it says."""
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "cwd": ROOT, **pipes}
     return subprocess.Popen([sys.executable, *map(str, words)], env=environment_of(), **pipes)
+
+
+def forked_process(target, *arguments):
+    """One that runs, from one that has loaded what a training needs."""
+    processes = multiprocessing.get_context("forkserver")
+    processes.set_forkserver_preload(["warp_splat.training.command"])
+    process = processes.Process(target=target, args=arguments)
+    process.start()
+    return process
 
 
 def interrupt(monkeypatch, iteration):

@@ -167,7 +167,7 @@ def test_what_refuses_is_asked_again(importable):
     assert len(verdicts) == 5 and all("refuses: EOFError" in verdict for verdict in verdicts)
 
 
-@pytest.mark.slow
+@pytest.mark.long  # it waits for half a minute
 def test_a_page_that_hangs_gets_a_row_and_the_next_scene_is_drawn(tmp_path):
     """Playwright gives the first one up after half a minute; that tab answers no more."""
     pytest.importorskip("playwright")

@@ -159,6 +159,7 @@ def test_blocks_are_not_trained_where_another_model_is(trained, tmp_path, fails)
     assert list(ply.glob("*/*.ply"))
 
 
+@pytest.mark.slow
 def test_all_blocks_by_one_command_are_those_of_many(trained, tmp_path, capsys, monkeypatch, fails):
     """Stopped within the second block, and gone on with; a block that has ended is not trained again."""
     put(trained, tmp_path, 0)

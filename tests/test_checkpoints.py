@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import safetensors.numpy
 import torch
-from commands import ROOT, SCENE, SHORT, interrupt, no_space, train
+from commands import ROOT, SCENE, SHORT, forked_process, interrupt, no_space, train
 from hostile import refusal
 from scene_files import pose, write_colmap
 from splat_files import some_splats
@@ -321,15 +321,6 @@ def test_two_processes_stop_and_resume(tmp_path):
 
 #: Processes that have loaded torch are forked.
 forked = pytest.mark.skipif(not hasattr(os, "fork"), reason="there are no forks")
-
-
-def forked_process(target, *arguments):
-    """One that runs, from one that has loaded what a training needs."""
-    processes = multiprocessing.get_context("forkserver")
-    processes.set_forkserver_preload(["warp_splat.training.command"])
-    process = processes.Process(target=target, args=arguments)
-    process.start()
-    return process
 
 
 def keep_writing(path, told):

@@ -160,7 +160,7 @@ def test_a_full_disk_leaves_no_part_of_a_file(tmp_path, ending, left):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("encoding", ["ascii", "latin-1"])
+@pytest.mark.parametrize("encoding", ["ascii", pytest.param("latin-1", marks=pytest.mark.slow)])
 def test_a_name_that_a_terminal_cannot_say(tmp_path, encoding):
     save_gaussians(tmp_path / "a.ply", some_file(9))
     command = ["-m", "warp_splat", "convert", tmp_path / "a.ply", tmp_path / "漢.spz"]

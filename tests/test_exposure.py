@@ -247,6 +247,7 @@ def test_light_times_a_number_is_a_gain_of_what_a_screen_shows():
         assert np.abs(to_srgb(light * 2**stops, np.where) - expected)[light * 2**stops > 0.0032].max() < 1e-12
 
 
+@pytest.mark.slow
 def test_inspect_tells_it_beside_exif(faulty, tmp_path, capsys):
     """Two photographs of three have EXIF."""
     folder, truth = faulty

@@ -231,6 +231,7 @@ def test_a_scene_with_coordinates_is_upright_and_says_where(tmp_path):
     assert finding.level == "warning"
 
 
+@pytest.mark.slow
 def test_gaussians_from_another_origin_are_refused(tmp_path, fails):
     """Those of a file, of a model folder, and of a training that goes on: the scene was placed anew since."""
     scene, here, there = tmp_path / "scene", {"origin": [1.0, 2.0, 3.0]}, {"origin": [9.0, 2.0, 1.0]}
@@ -258,6 +259,7 @@ def test_gaussians_from_another_origin_are_refused(tmp_path, fails):
         assert json.loads((place / "cameras.json").read_text())[0]["origin"] == here["origin"]
 
 
+@pytest.mark.slow
 def test_a_model_of_other_cameras_is_refused(tmp_path, fails):
     """Structure from motion was run again: names are the same, and places are not."""
     model, cameras = tmp_path / "model", tmp_path / "model" / "cameras.json"

@@ -12,7 +12,7 @@ from scene_files import HEIGHT, WIDTH, texture, write_blender, write_colmap, wri
 from test_scene_input import BAD
 
 from warp_splat.cli import main
-from warp_splat.inspect import cost, geometry
+from warp_splat.inspect import command, cost, geometry
 from warp_splat.inspect.subject import read_subject
 from warp_splat.scene import load_scene
 from warp_splat.training import deadline, memory
@@ -277,6 +277,7 @@ def test_a_few_steps_tell_how_long_a_training_takes(tmp_path, capsys, monkeypatc
     """By the steps of a trial; without them where memory is short; nothing of a scene that training refuses."""
     half = lambda trial, _: StepTime(len(trial.model), trial.scene.train[0].camera.width, 0.5)  # noqa: E731
     monkeypatch.setattr(deadline, "_of_step", half)
+    monkeypatch.setattr(command, "draw_pictures", lambda _: [])
 
     def told():
         return [(level, text) for level, check, text in examine(SCENE, tmp_path, capsys, 0)[0] if check == "forecast"]

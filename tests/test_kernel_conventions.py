@@ -162,7 +162,7 @@ def test_functions_that_cannot_be_put_in_place_are_refused(part, message):
 
 LINES = [
     ("project", "    rotation_w = times(qw, rotation_scale)\n"),
-    ("perspective_lens", "    v0 = of_lens(camera, 15, z)\n"),
+    pytest.param("perspective_lens", "    v0 = of_lens(camera, 15, z)\n", marks=pytest.mark.slow),
 ]
 
 

@@ -144,6 +144,7 @@ def test_nothing_to_go_by():
         np.testing.assert_array_equal(view.depth, wanted.depth)
 
 
+@pytest.mark.slow
 def test_any_number_of_threads(threads):
     views, (wrong, photographs, _) = [ball(index) for index in range(4)], patterned()
     found = []

@@ -43,6 +43,7 @@ def allocated(monkeypatch):
     return found
 
 
+@pytest.mark.slow
 def test_buffers_are_used_again(simulation, allocated):
     """After the first call nothing takes memory of Warp's; images stay in place."""
     state, transforms = state_of(simulation), wp.array(CAMERAS, dtype=wp.transform)

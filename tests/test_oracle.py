@@ -139,7 +139,7 @@ def differentiable(scene, **options):
 @pytest.mark.parametrize(
     ("seed", "degree", "options"),
     [
-        (0, 0, {}),
+        pytest.param(0, 0, {}, marks=pytest.mark.slow),
         pytest.param(1, 1, {"antialiasing": True}, marks=pytest.mark.slow),
         pytest.param(2, 2, {"sh_degree": 1}, marks=pytest.mark.slow),
         (3, 3, {}),

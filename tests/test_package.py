@@ -42,6 +42,7 @@ def test_ctrl_c_while_libraries_end():
     assert "Traceback" not in python("-c", f"{code}; cli.main(['view'])", check=False).stderr
 
 
+@pytest.mark.slow
 def test_every_public_name_exists_after_any_other_import():
     """One process for all: lazily loaded names must not be shadowed by modules of the same name."""
     lines = ["import warp_splat.training.trainer", "from warp_splat import *"]
@@ -85,6 +86,7 @@ def image(count=3000):
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
+@pytest.mark.slow
 def test_a_forked_child_renders_too():
     image()  # other workers wait for kernels that this process compiles, and would compile those of another again
     code = (

@@ -41,7 +41,7 @@ def test_a_bound_changes_no_byte(options, scene, bounded, tmp_path):
     check_same(resumed(bounded[1], tmp_path / "resumed", (20, 36), then=scene, **options), whole)
 
 
-@pytest.mark.parametrize("fit", [10**9, 20])
+@pytest.mark.parametrize("fit", [pytest.param(10**9, marks=pytest.mark.slow), 20])
 def test_what_does_not_fit_is_decoded_once_while_the_disk_has_room(scene, bounded, tmp_path, monkeypatch, fit):
     """A header of 128 bytes is before each."""
     room = 2 * fit * (SIZE + 128)

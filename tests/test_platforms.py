@@ -173,6 +173,7 @@ def test_the_embedded_scene_trains_to_the_same_bytes(tmp_path):
     assert models[0] == models[1]
 
 
+@pytest.mark.slow
 def test_every_room_can_be_imported():
     python("-c", f"{HIDE}import warp_splat.sfm.command, warp_splat.inspect.command, warp_splat.training.command")
 

@@ -192,6 +192,7 @@ def folder(tmp_path_factory):
     return folder, splats
 
 
+@pytest.mark.slow
 def test_simplify_to_a_share_with_training(folder, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("warp_splat.pruning.simplify.LEVELS", (1.0, 0.6))
     folder, splats = folder

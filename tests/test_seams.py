@@ -144,6 +144,7 @@ def test_what_a_part_learns_is_adams_step_of_the_mean_gradient(scene, monkeypatc
         assert torch.allclose(gains.detach().double(), copy.detach(), rtol=5e-7, atol=1e-8) and gains.grad is None
 
 
+@pytest.mark.slow
 def test_flags_files_and_output_know_them(tmp_path, capsys, fails):
     """Of those that the scene does not need, the figure is told."""
     options = "--no-quiet --parts auto --growth faint --gain_lr 0.5 --iterations 12"

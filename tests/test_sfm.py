@@ -302,6 +302,7 @@ def test_training_on_photographs_alone_names_the_command(tmp_path, monkeypatch):
     refusal(lambda: load_scene(clip), "a video", f"sfm {clip} {tmp_path / 'clip_scene'}")
 
 
+@pytest.mark.slow
 def test_training_with_sfm_makes_the_scene_once(photos, capsys):
     source, made = str(photos[0]), f"{photos[0]}_scene"
     assert scene_for(source, 1, quiet=True) == made and len(load_scene(made).train) == COUNT

@@ -260,6 +260,7 @@ def test_render_says_that_the_scene_is_another(told, tmp_path, capsys):
         assert (f"the model was trained on {SCENE}" in capsys.readouterr().out) == said
 
 
+@pytest.mark.slow
 def test_photographs_that_were_trained_on_test_nothing(told, tmp_path, fails, capsys):
     """One photograph less, and every eighth is another; what was measured stays."""
     scene, before = shutil.copytree(SCENE, tmp_path / "scene"), (told / "results.json").read_bytes()

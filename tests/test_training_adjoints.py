@@ -85,6 +85,7 @@ def test_cap_of_one_entry_costs_quality(scene):
     assert qualities[1] < qualities[0] - 1
 
 
+@pytest.mark.slow
 def test_refusal_is_a_row(tiny, scene, tmp_path, monkeypatch):
     monkeypatch.setattr("warp_splat.runtime.launch.available_memory", lambda device: 0)
     said = []
