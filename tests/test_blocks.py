@@ -155,7 +155,7 @@ def test_blocks_are_not_trained_where_another_model_is(trained, tmp_path, fails)
     """Also one without a checkpoint."""
     ply = shutil.copytree(trained / "point_cloud", tmp_path / "point_cloud")
     words = "train", "-s", SCENE, "-m", tmp_path, *SHORT, "--blocks", "2"
-    assert "it already holds a training, or another model; choose another with -m" in fails(*words)
+    assert "it already holds a model that was not merged of blocks; choose another with -m" in fails(*words)
     assert list(ply.glob("*/*.ply"))
 
 
