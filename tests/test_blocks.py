@@ -146,8 +146,8 @@ def test_a_merge_says_what_is_wrong(found, trained, tmp_path, fails):
 
 def test_no_gaussians_are_merged_without_what_they_are_drawn_with(trained, tmp_path, fails):
     put(trained, tmp_path, 0, 1)
-    (tmp_path / "cfg_args").mkdir()
-    assert "cfg_args" in fails("merge", tmp_path)
+    (tmp_path / "input.ply").mkdir()
+    assert "input.ply" in fails("merge", tmp_path)
     assert not list(tmp_path.glob("point_cloud/*/*"))
 
 
@@ -202,7 +202,7 @@ def test_what_a_block_cannot_have(trained, tmp_path, fails, monkeypatch):
     for name, value in (("--block", "1/2"), ("--minutes", "1"), ("--resume", trained)):
         more = () if name == "--resume" else ("-s", SCENE)
         assert f"--blocks: expected no {name} beside it" in fails("train", *more, "--blocks", "2", name, value)
-    assert "it already holds a training" in fails("train", "-s", SCENE, "--blocks", "2", "-m", trained)
+    assert "it already holds a model that was not merged" in fails("train", "-s", SCENE, "--blocks", "2", "-m", trained)
     assert "expected another folder than the scene's" in fails("train", "-s", SCENE, "--blocks", "2", "-m", SCENE)
     monkeypatch.setenv("WORLD_SIZE", "2")
     assert "--blocks: expected one process" in fails("train", "-s", SCENE, "--blocks", "2")
