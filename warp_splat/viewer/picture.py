@@ -1,7 +1,5 @@
 """What a frame shows: colors, depth or opacity, and a photograph over them."""
 
-import functools
-
 import numpy as np
 import torch
 from PIL import Image
@@ -49,18 +47,13 @@ def depth_colors(depth: torch.Tensor, alpha: torch.Tensor, near: float, far: flo
         near: depth of the first color, positive.
         far: of the last, positive.
     """
-    farthest, reach = 1.0 / far, max(1.0 / near - 1.0 / far, 1e-6)
-    place = ((1.0 / depth.clamp_min(NEAR) - farthest) / reach).clamp(0.0, 1.0)
-    table = torch.from_numpy(_turbo()).to(depth.device)
-    return table[(place * (len(table) - 1)).round().long()] * alpha[..., None]
-
-
-@functools.cache
-def _turbo() -> np.ndarray:
-    """The color map "turbo" (Mikhailov 2019) from blue to red, [256, 3] float32."""
     import matplotlib  # noqa: PLC0415 - takes a while, and most look at the image
 
-    return matplotlib.colormaps["turbo"](np.arange(256))[:, :3].astype(np.float32)
+    farthest, reach = 1.0 / far, max(1.0 / near - 1.0 / far, 1e-6)
+    place = ((1.0 / depth.clamp_min(NEAR) - farthest) / reach).clamp(0.0, 1.0)
+    turbo = matplotlib.colormaps["turbo"](np.arange(256))[:, :3]  # of Mikhailov 2019, from blue to red
+    table = torch.from_numpy(turbo.astype(np.float32)).to(depth.device)
+    return table[(place * (len(table) - 1)).round().long()] * alpha[..., None]
 
 
 def overlay(frame: np.ndarray, photograph: np.ndarray, box: Box, opacity: float) -> np.ndarray:
