@@ -119,14 +119,17 @@ def _claim(source: Path, scene: Path, config: SfmConfig) -> Path:
     if source.resolve() == scene.resolve():
         raise InputError(f"{scene}: expected another folder than that of the photographs for the scene; choose one.")
     if source.is_dir():
-        root = photo_root(source).resolve()
-        if root == scene.resolve() or scene.resolve() in root.parents:
+        root = photo_root(source)
+        if scene.resolve() in (root.resolve(), *root.resolve().parents):
             raise InputError(
                 f"{scene}: expected a folder for the scene that does not hold the photographs, since its images/ would "
                 f"be written over; choose another, such as {scene_of(scene)}."
             )
-        if not (files := [(name, photo_root(source) / name) for name in find_files(photo_root(source), PHOTOS, scene)]):
-            raise _nothing_found(source)
+        if not (files := [(name, root / name) for name in find_files(root, PHOTOS, scene)]):
+            videos = find_files(root, VIDEOS)
+            hint = f"name the video itself: {shlex.quote(str(root / videos[0]))}" if videos else "check the path"
+            expected = f"expected photographs ({', '.join(PHOTOS)})"
+            raise InputError(f"{source}: {expected}, found none; {jpeg_hint(source) or hint}.")
     else:
         files = [(source.name, source)]
     record = json.dumps({"options": options, "files": {name: path.stat().st_size for name, path in files}}, indent=1)
@@ -145,12 +148,6 @@ def _claim(source: Path, scene: Path, config: SfmConfig) -> Path:
         write_text(work / "input.json", record)
         write_text(work / MARKS, marks)
     return work
-
-
-def _nothing_found(source: Path) -> InputError:
-    videos = find_files(photo_root(source), VIDEOS)
-    hint = f"name the video itself: {shlex.quote(str(photo_root(source) / videos[0]))}" if videos else "check the path"
-    return InputError(f"{source}: expected photographs ({', '.join(PHOTOS)}), found none; {jpeg_hint(source) or hint}.")
 
 
 def _frames(video: Path, work: Path, config: SfmConfig, say) -> Path:
