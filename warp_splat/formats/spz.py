@@ -20,7 +20,7 @@ import numpy as np
 
 from warp_splat.formats.files import Unexpected, atomic_write, check_expansion, reading
 from warp_splat.formats.splats import COEFFICIENTS, SplatArrays, SplatFile, frame, turned
-from warp_splat.formats.stored import OTHERS, clipped, from_smallest_three, logit, sigmoid, unit_quats
+from warp_splat.formats.stored import clipped, from_smallest_three, logit, sigmoid, smallest_three, unit_quats
 from warp_splat.text import Report
 
 MAGIC = b"NGSP"
@@ -127,12 +127,9 @@ def _bytes(values: np.ndarray) -> bytes:
 
 def _pack_quats(quats: np.ndarray) -> np.ndarray:
     """Rotations as uint32: which of x y z w is largest (2 bits), then the others in that order (sign, 9 bits)."""
-    xyzw = unit_quats(quats)[:, [1, 2, 3, 0]]
-    largest = np.abs(xyzw).argmax(axis=1)
-    others = np.take_along_axis(xyzw, OTHERS[largest], axis=1)
-    negative = (others < 0) ^ (np.take_along_axis(xyzw, largest[:, None], axis=1) < 0)
-    size = np.minimum(np.rint(511 * np.sqrt(2) * np.abs(others)), 511).astype("<u4")
-    return largest.astype("<u4") << 30 | (negative.astype("<u4") << 9 | size) @ FIELDS
+    largest, others = smallest_three(unit_quats(quats)[:, [1, 2, 3, 0]])
+    size = np.minimum(np.rint(1022 * np.abs(others)), 511).astype("<u4")
+    return largest.astype("<u4") << 30 | (np.signbit(others).astype("<u4") << 9 | size) @ FIELDS
 
 
 def _unpack_quats(stream: np.ndarray) -> np.ndarray:
