@@ -58,10 +58,10 @@ def simplify(config: SimplifyConfig) -> int:
         return largest_change(before, after, cameras, opened.setting.background, opened.setting.options)
 
     if config.tolerance:
-        count = _fewest(total, lambda count: changed(made(count))[1] <= config.tolerance)
+        _, count = _narrowed(0, total, lambda count: changed(made(count))[1] > config.tolerance)
     elif config.max_loss:
         least = opened.psnr(file.splats, views) - config.max_loss
-        count = _fewest(total, lambda count: opened.psnr(made(count), views) >= least)
+        _, count = _narrowed(0, total, lambda count: opened.psnr(made(count), views) < least)
     else:
         count = _count(config, output, file, thinning.to)
     splats = made(count)
@@ -118,26 +118,17 @@ def _count(config: SimplifyConfig, output: Path, file: SplatFile, to: Callable[[
         count = round(config.keep * total)
     else:
         most = bytes_of(config.size)
-        count = _most(total, lambda count: written_bytes(output, file._replace(splats=to(count))) <= most)
+        fits = lambda count: written_bytes(output, file._replace(splats=to(count))) <= most  # noqa: E731
+        if fits(total):
+            return total
+        count = _narrowed(1, total, fits)[0] if fits(1) else 0
     if not count:
         raise InputError(f"{config.model}: nothing would be left of {total} Gaussians; keep more, or allow more bytes.")
     return count
 
 
-def _fewest(total: int, good: Callable[[int], bool]) -> int:
-    """The least count found that is ``good``; ``total`` is."""
-    return _narrowed(0, total, lambda count: not good(count))[1]
-
-
-def _most(total: int, good: Callable[[int], bool]) -> int:
-    """The largest count found that is ``good``, 0 if none is."""
-    if good(total):
-        return total
-    return _narrowed(1, total, good)[0] if good(1) else 0
-
-
 def _narrowed(low: int, high: int, is_low: Callable[[int], bool]) -> tuple[int, int]:
-    """Nearer to where ``is_low`` ends: it holds of the first of the two, and not of the second."""
+    """Counts nearer to where ``is_low`` ends: it holds of the first of the two, and not of the second."""
     for _ in range(TRIES):
         if high - low < 2:
             break
