@@ -46,8 +46,7 @@ def check_reprojection(subject: Subject) -> Iterator[Finding]:
         if not pairs:
             continue
         keypoints, xyz = (np.array(column, np.float64) for column in zip(*pairs, strict=True))
-        pose = image.cam_from_world().matrix()
-        in_camera = xyz @ pose[:, :3].T + pose[:, 3]
+        in_camera = image.cam_from_world() * xyz
         front = in_camera[:, 2] > 0
         errors = np.full(len(xyz), np.inf)  # a point behind the camera that observed it
         errors[front] = np.linalg.norm(image.camera.img_from_cam(in_camera[front]) - keypoints[front], axis=1)
