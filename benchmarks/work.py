@@ -107,7 +107,7 @@ def count(gaussians: Gaussians, camera: Camera, options: RasterOptions) -> Count
         inputs = [bins.view(blocks=blocks), alphas_of(options), view(stopped, vec16), camera.width, camera.height]
         launch(count_pairs, len(pairs), inputs, [view(pairs, wp.int64)], bounds=bins.slices)
     pixels = camera.width * camera.height
-    coefficients = (camera_view(camera, gaussians.sh_rest.shape[1], options).sh_degree + 1) ** 2
+    coefficients = (camera_view(camera, gaussians.sh_rest.shape[1], options, camera).sh_degree + 1) ** 2
     drawn, instances = len(bins.gaussians), len(bins.instances)
     return Counts(len(gaussians.means), coefficients, drawn, pixels, instances, *pairs.sum(0).tolist())
 

@@ -35,10 +35,10 @@ from warp_splat.runtime.timers import stage
 Tensors = Sequence[torch.Tensor]
 
 
-def camera_view(camera: Camera, rest: int, options: RasterOptions, limits: Camera | None = None) -> CameraView:
+def camera_view(camera: Camera, rest: int, options: RasterOptions, limits: Camera) -> CameraView:
     """The camera as kernels read it; ``rest`` is the number of coefficients beyond the first.
 
-    ``limits``: the camera whose field of view limits the slopes, if it is another.
+    ``limits``: the camera whose field of view limits the slopes.
     """
     degree = {0: 0, 3: 1, 8: 2, 15: 3}[rest]
     size = np.array([camera.width, camera.height])
@@ -47,7 +47,6 @@ def camera_view(camera: Camera, rest: int, options: RasterOptions, limits: Camer
     center = camera.center.astype(np.float32)
     cam.center, cam.center_low = wp.vec3(*center), wp.vec3(*(camera.center - center))
     cam.focal, cam.principal, cam.size = wp.vec2(camera.fx, camera.fy), wp.vec2(camera.cx, camera.cy), wp.vec2(*size)
-    limits = limits or camera
     focal, principal = np.array([limits.fx, limits.fy]), np.array([limits.cx, limits.cy])
     margin = FRUSTUM_MARGIN * 0.5 * size / focal
     cam.slope_min = wp.vec2(*(-principal / focal - margin))
