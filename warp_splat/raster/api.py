@@ -182,7 +182,7 @@ def render(
         with stage("bin"):
             drawn, certificate = copied, None
             if chosen.bound:
-                drawn, certificate = certify(copied, gaussians, crossing, seen, background, chosen, driver)
+                drawn, certificate = certify(copied, gaussians, crossing, seen, background, chosen)
             # 'stored' keeps 1 KiB of each instance: too much for some that there are not
             bins = driver.bin(drawn, seen, looking(chosen), None if adjoint == "stored" else room)
             bins = bins if tiles is None else only(bins, tiles)

@@ -10,7 +10,7 @@ from warp_splat.config import ALPHA_MIN, TILE, RasterOptions
 from warp_splat.errors import InputError
 from warp_splat.kernels.bound import FAINT, SEEN, BoundView, Rules, make_spread
 from warp_splat.raster.data import Bins, Gaussians, Splats2D, falloff_of
-from warp_splat.raster.drivers import Driver
+from warp_splat.raster.drivers import driver_of
 from warp_splat.raster.seam import Crossing, with_copies
 from warp_splat.runtime.launch import launch, pack_struct, view
 from warp_splat.runtime.pool import even_slices
@@ -68,7 +68,6 @@ def certify(
     camera: Camera,
     background: torch.Tensor,
     options: RasterOptions,
-    driver: Driver,
 ) -> tuple[Splats2D, Certificate]:
     """The splats as they are drawn, of those that :func:`far_reaching` options give; and what the blend is told.
 
@@ -99,7 +98,7 @@ def certify(
         worst = 4.0 * max(options.alpha_min, faint, 0.012 * rules.square)  # alpha outside of where the blend looks
         rules.usual, rules.unit = usual, 1.1 * max(count, 1) * worst * max(brightest / usual, 1.0) / 2**31
         lost = torch.zeros(1, dtype=torch.int32, device=device)
-        threads = driver.peeks  # each has maps of its own
+        threads = driver_of(device).peeks  # each has maps of its own
         bounds = even_slices(count) if threads else list(range(count + 1))
         rows, columns = 4 * -(-camera.height // TILE), 4 * -(-camera.width // TILE)
         new = {"dtype": torch.int32, "device": device}
