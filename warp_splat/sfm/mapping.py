@@ -57,7 +57,7 @@ def reconstruct(
         told = ", ".join(f"{name} {_told(found[name][0], *fits[name]) if name in fits else 'none'}" for name in found)
         say(f"cameras by {best} mapping; photographs of {images}: {told}")
         every = found[best] + [model for name, each in found.items() if name != best for model in each]
-        _made(models, partial(_finish, database, root, config, every, images))
+        _made(models, partial(_finish, database, root, config, every))
         shutil.rmtree(begun)
     return {int(folder.name): pycolmap.Reconstruction(str(folder)) for folder in models.iterdir()}
 
@@ -188,16 +188,14 @@ def _map_stepwise(database: Path, root: Path, config: SfmConfig, part: Path, sta
     run_watched(part, "cameras", _sizes(database)[0], work, lambda: len(registered), config.quiet)
 
 
-def _finish(
-    database: Path, root: Path, config: SfmConfig, models: list[pycolmap.Reconstruction], images: int, part: Path
-) -> None:
+def _finish(database: Path, root: Path, config: SfmConfig, models: list[pycolmap.Reconstruction], part: Path) -> None:
     """Write the first of ``models``, joined with others and completed, and those that show other photographs."""
     if not models:
         return
     model, others = joined(models, database, root, part, config.threads)
     (part / "0").mkdir()
     model.write(str(part / "0"))
-    if 0 < model.num_reg_images() < images:
+    if 0 < model.num_reg_images() < _sizes(database)[0]:
         (part / "more").mkdir()
         _map_stepwise(database, root, config, part / "more", part / "0")
         if (part / "more" / "images.bin").is_file():  # where it begins with a model, it writes one there
