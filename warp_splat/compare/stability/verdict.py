@@ -141,15 +141,6 @@ def gradients_by_name(out, upstream: tuple, leaves: dict[str, torch.Tensor]) -> 
     return dict(zip(wanted, gradients, strict=True))
 
 
-def upstream_of(problem: Problem, fragile: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Random upstream gradients of image and alpha, float32, zero at fragile pixels."""
-    generator, shape = torch.Generator().manual_seed(1), fragile.shape
-    upstream = torch.randn(*shape, 3, generator=generator), torch.randn(*shape, generator=generator)
-    for weight in upstream:
-        weight.mul_(problem.gain)[fragile] = 0
-    return upstream
-
-
 @functools.cache
 def truth(build: Callable[[], Problem]) -> Expected:
     """What float64 says of the input, and the limits; computed once per input."""
@@ -159,7 +150,10 @@ def truth(build: Callable[[], Problem]) -> Expected:
     drawn = replace(problem, gaussians={name: rows[kept] for name, rows in problem.gaussians.items()})
     leaves = leaves_of(drawn, torch.float64)
     out = _draw_exactly(drawn, leaves)
-    upstream = upstream_of(problem, out.fragile)
+    generator, shape = torch.Generator().manual_seed(1), out.fragile.shape
+    upstream = torch.randn(*shape, 3, generator=generator), torch.randn(*shape, generator=generator)
+    for weight in upstream:
+        weight.mul_(problem.gain)[out.fragile] = 0
     gradients = gradients_by_name(out, tuple(weight.double() for weight in upstream), leaves)
     moved_image, moved = _condition(drawn, out, upstream, gradients) if problem.conditioned else (0.0, {})
 
