@@ -4,7 +4,6 @@ A monocular network knows inverse depth up to a factor and an offset, which were
 """
 
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -16,14 +15,8 @@ from warp_splat.scene.types import Scene, View
 
 ENDINGS = (".png", ".exr")
 PARAMETERS = "sparse/0/depth_params.json"
+FIT = ("scale", "offset")  # what makes 1 / depth [1 / world units] of a map
 NEAR_MEDIAN = 0.2, 5.0  # times the median scale: a map outside did not fit its points
-
-
-class Fit(NamedTuple):
-    """What makes 1 / depth [1 / world units] of a map."""
-
-    scale: float
-    offset: float
 
 
 def read_inverse_depths(scene: Scene, folder: str) -> dict[View, np.ndarray]:
@@ -45,10 +38,10 @@ def read_inverse_depths(scene: Scene, folder: str) -> dict[View, np.ndarray]:
     parameters = source / (PARAMETERS if takes_colmap(source) else Path(PARAMETERS).name)
     paths = {view: _find(source / folder, view) for view in scene.train}
     fits = _read_fits(parameters, [Path(v.name).with_suffix("").as_posix() for v in scene.train], paths)
-    median = float(np.median([fit.scale for fit in fits if fit.scale > 0] or [1.0]))
+    median = float(np.median([scale for scale, _ in fits if scale > 0] or [1.0]))
     low, high = (share * median for share in NEAR_MEDIAN)
     chosen = zip(paths.items(), fits, strict=True)
-    found = {view: _read(path, view, fit) for (view, path), fit in chosen if low <= fit.scale <= high}
+    found = {v: _read(p, v, scale, offset) for (v, p), (scale, offset) in chosen if low <= scale <= high}
     if not any((numbers >= 0).any() for numbers in found.values()):
         raise InputError(f"--depths {folder}: expected maps of 1 / depth, found scales or numbers below 0; fit them.")
     return found
@@ -67,10 +60,10 @@ def _find(folder: Path, view: View) -> Path:
     return found[0]
 
 
-def _read_fits(path: Path, names: list[str], maps: dict[View, Path]) -> list[Fit]:
-    """Of each name; those of EXR are optional."""
+def _read_fits(path: Path, names: list[str], maps: dict[View, Path]) -> list[list[float]]:
+    """Scale and offset of each name; those of EXR are optional."""
     if not path.is_file() and all(map.suffix == ".exr" for map in maps.values()):
-        return [Fit(1.0, 0.0)] * len(names)
+        return [[1.0, 0.0]] * len(names)
     if not path.is_file():
         raise InputError(
             f"{path}: expected scale and offset of each map of inverse depth, found no such file; write it, by fitting "
@@ -81,16 +74,16 @@ def _read_fits(path: Path, names: list[str], maps: dict[View, Path]) -> list[Fit
         return [_fit(entries, name) for name in names]
 
 
-def _fit(entries: dict, name: str) -> Fit:
+def _fit(entries: dict, name: str) -> list[float]:
     if not isinstance((entry := entries.get(name)), dict):
         raise Unexpected(f"none for {name}")
-    values = [entry.get(key) for key in Fit._fields]
+    values = [entry.get(key) for key in FIT]
     if not all(isinstance(value, int | float) and np.isfinite(float(value)) for value in values):
         raise Unexpected(f"{entry!s:.80} for {name}")
-    return Fit(*map(float, values))
+    return [float(value) for value in values]
 
 
-def _read(path: Path, view: View, fit: Fit) -> np.ndarray:
+def _read(path: Path, view: View, scale: float, offset: float) -> np.ndarray:
     """The numbers nearest to each pixel, which no filter mixes over edges."""
     numbers, (height, width) = read_numbers(path), (view.camera.height, view.camera.width)
     file = view.original.width, view.original.height
@@ -101,7 +94,7 @@ def _read(path: Path, view: View, fit: Fit) -> np.ndarray:
         )
     rows, columns = nearest_of(height, numbers.shape[0]), nearest_of(width, numbers.shape[1])
     picked = numbers[rows[:, None], columns]
-    found = np.where(picked < 0.0, np.nan, picked) * fit.scale + fit.offset
+    found = np.where(picked < 0.0, np.nan, picked) * scale + offset
     known = np.isfinite(found) & (found >= 0.0) & (True if (mask := view.mask) is None else mask > 0)
     return np.where(known, found, -1.0).astype(np.float32)
 
