@@ -130,10 +130,6 @@ def draw_case(problem: Problem, leaves: dict[str, torch.Tensor], mode: str) -> a
     return api.rasterize(*gaussians[:4], gaussians[4:], *rest, mode, problem.options)
 
 
-def _draw_exactly(problem: Problem, leaves: dict[str, torch.Tensor]) -> oracle.Render:
-    return draw_exactly(activated(problem, leaves), problem.camera, leaves["background"], problem.options)
-
-
 def gradients_by_name(out, upstream: tuple, leaves: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
     """Gradients of all leaves and of means2d."""
     wanted = leaves | {"means2d": out.means2d}
@@ -149,7 +145,7 @@ def truth(build: Callable[[], Problem]) -> Expected:
     kept = torch.tensor(sorted(set(range(count)) - set(problem.left_out)), dtype=torch.int64)
     drawn = replace(problem, gaussians={name: rows[kept] for name, rows in problem.gaussians.items()})
     leaves = leaves_of(drawn, torch.float64)
-    out = _draw_exactly(drawn, leaves)
+    out = draw_exactly(activated(drawn, leaves), drawn.camera, leaves["background"], drawn.options)
     generator, shape = torch.Generator().manual_seed(1), out.fragile.shape
     upstream = torch.randn(*shape, 3, generator=generator), torch.randn(*shape, generator=generator)
     for weight in upstream:
@@ -190,7 +186,7 @@ def _condition(problem: Problem, out, upstream, gradients) -> tuple[float, dict[
         lens = {key: float(_nudge(np.float64(getattr(camera, key)), rng)) for key in ("fx", "fy", "cx", "cy")}
         rotation = _nudge(camera.rotation, rng)
         nudged = replace(camera, rotation=rotation, translation=-rotation @ camera.center, **lens)
-        other = _draw_exactly(replace(problem, camera=nudged), leaves)
+        other = draw_exactly(activated(problem, leaves), nudged, leaves["background"], problem.options)
         image = max(image, _pixel_errors(other, out)[~out.fragile].max().item())
         for name, value in gradients_by_name(other, tuple(weight.double() for weight in upstream), leaves).items():
             moved[name] = max(moved[name], relative_error(value, gradients[name], problem.gain))
