@@ -7,6 +7,7 @@ threads that fit on a multiprocessor at once. The loop is the longest one withou
 machine code; of a blend, that is what a warp does for a tile instance at most.
 """
 
+import hashlib
 import json
 import re
 import subprocess
@@ -110,7 +111,8 @@ def modules() -> dict[str, wp.Module]:
 
 def versions_of() -> dict[str, str]:
     """What a module's machine code depends on, by its name: a change of Warp, of its source or options changes it."""
-    return {name: f"{wp.config.version}, {module.hash_module().hex()}" for name, module in modules().items()}
+    here = f"{wp.config.version}, {hashlib.sha256(Path(__file__).read_bytes()).hexdigest()}"  # and of how
+    return {name: f"{here}, {module.hash_module().hex()}" for name, module in modules().items()}
 
 
 def cuobjdump() -> str | None:

@@ -71,6 +71,12 @@ def pytest_sessionstart():
             wp.load_module(module, device="cpu")
 
 
+@pytest.fixture
+def laid_out(monkeypatch):
+    """Pictures as users get them."""
+    monkeypatch.setattr(report, "new_figure", new_figure)
+
+
 @pytest.fixture(params=["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"])
 def device(request) -> str:
     """Every device that the renderer supports."""

@@ -117,7 +117,7 @@ WRONG = {
     "found another model": ((0, 1), lambda folder: (folder / LAST).touch()),
     "trainings by --block, found another model": (
         (0, 1),
-        lambda folder: shutil.copytree(folder / "1" / "point_cloud", folder / "point_cloud"),
+        lambda folder: shutil.copy(folder / "1" / "config.toml", folder),
     ),
     "found 0 of block 2/2": ((0,), None),
     "found 2 of block 1/2, 0 of block 2/2": ((0, "00"), None),

@@ -8,7 +8,7 @@ import random
 import shutil
 import sys
 import time
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from dataclasses import replace
 
 import numpy as np
@@ -132,8 +132,11 @@ def test_ctrl_c_and_resume(whole, tmp_path, monkeypatch, capsys, fails):
     assert f"--resume {folder}" in fails("train", "--resume", str(named))
     assert "expected at least 60, as in" in fails("train", "--resume", str(folder), "--iterations", "59")
     others = {"sh_degree": "2", "optimizer_type": "sparse_adam", "seed": "1", "preset": "fast", "start_ply": "a.ply"}
+    others |= {"projection": "ellipsoid"}
     for option, value in others.items():
         assert f"--{option} {value}: expected" in fails("train", "--resume", str(folder), f"--{option}", value)
+    for flag in ("antialiasing", "white_background"):
+        assert f"--{flag} True: expected False" in fails("train", "--resume", str(folder), f"--{flag}")
     assert files_of(folder) == before
 
 
@@ -187,9 +190,7 @@ def test_resume_past_the_end_is_a_longer_run(whole, tmp_path):
     assert train(tmp_path / "longer", "--iterations", "90") == 0
     assert main(["train", "--resume", str(whole), "--iterations", "90", "--quiet"]) == 0
     assert ply_path(tmp_path / "longer", 90).read_bytes() == ply_path(whole, 90).read_bytes()
-    options = (
-        "--iterations 120 -r 8 --adjoint stepwise --densify_until_iter 110 --max_gaussians 40000 --white_background"
-    )
+    options = "--iterations 120 -r 8 --adjoint stepwise --densify_until_iter 110 --max_gaussians 40000"
     assert main(["train", "--resume", str(whole), *options.split()]) == 0
     config = parse(["train", "--resume", str(whole)])
     assert (config.data.resolution, config.model.adjoint, config.grow.max_gaussians) == (8, "stepwise", 40000)
@@ -336,12 +337,14 @@ def test_a_writer_that_is_killed_leaves_a_whole_checkpoint(moments, tmp_path):
     for _ in range(moments):
         heard, told = multiprocessing.Pipe(duplex=False)
         process = forked_process(keep_writing, path, told)
+        told.close()
         last = heard.recv()
         time.sleep(moment.uniform(0, 0.1))
         process.kill()
         process.join()
-        while heard.poll():
-            last = heard.recv()
+        with suppress(EOFError):
+            while True:
+                last = heard.recv()
         checkpoint = load_checkpoint(path)
         count = checkpoint.count("count")
         assert count in (last, last + 1) and (checkpoint.arrays["a"] == count).all()

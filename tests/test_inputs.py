@@ -26,6 +26,7 @@ from warp_splat.errors import InputError
 from warp_splat.formats.exchange import save_gaussians
 from warp_splat.formats.model_folder import ply_path
 from warp_splat.scene import load_scene
+from warp_splat.scene.images import read_mask
 from warp_splat.training.loss import image_loss
 from warp_splat.training.options import TrainConfig
 from warp_splat.training.trainer import Trainer
@@ -175,7 +176,7 @@ def write_exr(path, channels, size=(WIDTH, HEIGHT)):
     """An EXR of so many pixels, whose picture has those of the others; a channel is 1/8, 2/8, ..., or no number."""
     spec, file = oiio.ImageSpec(*size, len(channels), oiio.FLOAT), oiio.ImageOutput.create("a.exr")
     spec.channelnames, spec.full_width, spec.full_height = channels, WIDTH, HEIGHT
-    values = [{"Z": 1e30, "A": 1.0}.get(name[-1], (1 + place) / 8) for place, name in enumerate(channels)]
+    values = [{"Z": 1e30, "A": 1.0, "cut.A": 0.5}.get(name, (1 + place) / 8) for place, name in enumerate(channels)]
     pixels = np.tile(np.float32(values), (size[1], size[0], 1))
     assert file.open(str(path), spec) and file.write_image(pixels) and file.close()
 
@@ -187,13 +188,14 @@ def write_exr(path, channels, size=(WIDTH, HEIGHT)):
         ("Z L.R L.G L.B L.A", [2, 3, 4]),
         ("Albedo.R Albedo.G Albedo.B R G B A", [4, 5, 6]),
         ("Y", [1, 1, 1]),
+        ("V", [1, 1, 1]),
         ("Y A", [1, 1, 1]),
+        ("Red Green Blue", [1, 2, 3]),
+        ("R G B matte.B", [1, 2, 3]),
         (
             "Albedo.R Albedo.G Albedo.B L.R L.G L.B L.A",
             r"channels Albedo\.R, Albedo\.G, Albedo\.B and 4 more instead of",
         ),
-        ("Z", "channels Z instead of R, G, B"),
-        ("R G", "channels R, G instead of R, G, B"),
     ],
 )
 def test_colors_of_an_exr_are_found_by_their_names(tmp_path, channels, found):
@@ -208,7 +210,20 @@ def test_colors_of_an_exr_are_found_by_their_names(tmp_path, channels, found):
 def test_an_exr_with_fewer_pixels_than_its_picture_is_refused(tmp_path):
     root = write_colmap(tmp_path, ["a.exr"])
     write_exr(root / "images" / "a.exr", ["R", "G", "B"], (WIDTH // 2, HEIGHT // 2))
-    refusal(lambda: load(root), f"only {WIDTH // 2} x {HEIGHT // 2} of {WIDTH} x {HEIGHT} pixels")
+    refusal(lambda: load(root), f"a data window that is not its picture of {WIDTH} x {HEIGHT}")
+
+
+@pytest.mark.parametrize("channels", ["A", "V", "Y"])
+def test_masks_in_an_exr_have_one_channel_of_any_name(tmp_path, channels):
+    write_exr(tmp_path / "a.exr", [channels])
+    assert read_mask(tmp_path / "a.exr", (WIDTH, HEIGHT), invert=False).all()
+
+
+def test_alpha_of_an_exr_is_that_of_its_colors(tmp_path):
+    root = write_colmap(tmp_path, ["a.exr"])
+    write_exr(root / "images" / "a.exr", ["R", "G", "B", "cut.A"])
+    found = load(root)[0].train[0]
+    assert found.alpha is None and (found.image == np.float32([1, 2, 3]) / 8).all()
 
 
 def test_one_kind_of_light_in_a_scene(tmp_path):

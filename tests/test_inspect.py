@@ -47,6 +47,7 @@ def change_model(scene, change):
     model.write_binary(scene / "sparse" / "0")
 
 
+@pytest.mark.usefixtures("laid_out")
 def test_a_good_scene_has_no_finding(tmp_path, capsys):
     findings, page = examine(SCENE, tmp_path, capsys, 0)
     assert not worst(findings)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import SCENE, full_disk, started
+from commands import full_disk, started
 from hostile import refusal
 from scene_files import write_colmap
 from scipy.spatial.transform import Rotation
@@ -242,18 +242,6 @@ def test_open_model(tmp_path, mark, monkeypatch, fails, capsys):
     message = fails("render", "-m", folder)
     assert "cfg_args: expected a projection of affine, ellipsoid, unscented, found 'fisheye'" in message
     assert drawn[1].linear and drawn[1].coordinates["origin"] == [1.0, 2.0, 3.0] and drawn[2]["linear_light"]
-
-
-def test_a_model_is_drawn_as_it_was_trained_though_training_went_on_otherwise(tmp_path):
-    folder, words = tmp_path / "model", ["train", "-s", str(SCENE), "-r", "8", "--quiet", "--iterations"]
-    assert main([*words, "2", "-m", str(folder)]) == 0
-    others = ["--antialiasing", "--projection", "ellipsoid", "--white_background"]
-    for iterations in ("4", "6"):
-        assert main([*words[:1], "--resume", str(folder), *others, "--iterations", iterations]) == 0
-        others = ["--no-antialiasing"]
-    names = ("antialiasing", "projection", "white_background")
-    found = [[model_folder.open_model(folder, iteration)[2][name] for name in names] for iteration in (2, 4, 6)]
-    assert found == [[False, "affine", False], [True, "ellipsoid", True], [False, "ellipsoid", True]]
 
 
 @pytest.mark.parametrize(

@@ -112,6 +112,7 @@ def test_one_seed_one_result_for_any_number_of_threads(trained, tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("laid_out")
 def test_another_seed_is_another_result(trained, tmp_path, capsys):
     digest = json.loads((trained / "results.json").read_text())["ours_60"]["sha256"]
     assert train(tmp_path, "--seed", "1", "--verify", digest) == 1

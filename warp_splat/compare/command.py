@@ -9,7 +9,7 @@ import torch
 from warp_splat.compare import adjoints
 from warp_splat.compare.plots import plot_errors
 from warp_splat.compare.stability import cases
-from warp_splat.compare.workloads import Workload, all_workloads, named_scenes
+from warp_splat.compare.workloads import CANDIDATES, Workload, in_training, layered, named_scenes
 from warp_splat.config import ADJOINTS, CompareConfig
 from warp_splat.errors import InputError
 from warp_splat.evaluation.report import machine
@@ -47,7 +47,10 @@ def run(config: CompareConfig) -> int:
     if config.stability:
         code = int(cases.run_cases(out, config.modes, say) > 0)
     else:
-        _compare_modes(all_workloads(scenes, device, say), config.modes, out, say)
+        workloads = [layered(candidates).to(device) for candidates in CANDIDATES]
+        for name, scene in scenes.items():
+            workloads += in_training(name, scene, device, say)
+        _compare_modes(workloads, config.modes, out, say)
     card = f"{torch.cuda.get_device_name(device)}, " if device.type == "cuda" else ""
     say(f"\nMeasured on {card}{machine()}, {pool.get_threads()} threads.")
     write_text(out / ("stability.txt" if config.stability else "compare.txt"), "\n".join([*log, ""]))

@@ -107,14 +107,6 @@ def named_scenes(scene: str, say: Callable[[str], None]) -> dict[str, Scene]:
     return found
 
 
-def all_workloads(scenes: dict[str, Scene], device: torch.device, say: Callable[[str], None]) -> list[Workload]:
-    """The layered scenes, and the others in training, on ``device``."""
-    found = [layered(candidates).to(device) for candidates in CANDIDATES]
-    for name, scene in scenes.items():
-        found += in_training(name, scene, device, say)
-    return found
-
-
 def sample_pixels(camera: Camera) -> torch.Tensor:
     """:data:`SAMPLES` pixels of the image at random, or all if it has no more, [P, 2] (row, column)."""
     chosen = np.random.default_rng(0).permutation(camera.width * camera.height)[:SAMPLES]

@@ -155,7 +155,7 @@ def find_checkpoint(path: str | Path) -> Path:
             raise InputError(f"{path}: no such file; {others[-1]} can be named instead.")
     if path.suffix in (".pth", ".pt", ".ckpt"):
         raise InputError(
-            f"{path}: expected {EXPECTED} ({LAST}), and none of torch's, which can run code when it is read; convert "
+            f"{path}: expected {EXPECTED} ({LAST}), not one of torch's, which can run code when it is read; convert "
             "its Gaussians to .ply with the program that wrote it."
         )
     if path.is_file() and path.suffix.lower() in FORMATS:

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from warp_splat.scene.types import View
 
 CAMERAS = "cameras.json"
-ENVIRONMENT, DRAWN = "environment.json", "drawn_by.json"  # beside the Gaussians
+ENVIRONMENT = "environment.json"
 AS_SAVED = "point_cloud/iteration_*/point_cloud.ply"
 
 
@@ -155,8 +155,7 @@ def open_model(
     """The iteration, the Gaussians and the options of the training, from a model folder or a file of Gaussians.
 
     Of a file, the iteration is 0. Where there is no cfg_args, the options are that every 8th view was held out, and
-    what the file tells; a file where training puts it has those of its folder. If training went on with other options,
-    those of before lie beside the Gaussians of before. ``crop`` as
+    what the file tells; a file where training puts it has those of its folder. ``crop`` as
     :func:`warp_splat.formats.splats.cropped` takes it, ``report`` as
     :func:`warp_splat.formats.exchange.load_gaussians`.
 
@@ -173,7 +172,6 @@ def open_model(
     if (projection := options.get("projection", PROJECTIONS[0])) not in PROJECTIONS:
         raise InputError(f"{args}: expected a projection of {', '.join(PROJECTIONS)}, found {projection!r:.40}.")
     options = {"antialiasing": found.antialiased, "linear_light": found.linear, **options}
-    options |= read_beside(path, iteration, DRAWN, "options as training writes them", dict) or {}
     marks = {"antialiased": bool(options["antialiasing"]), "linear": bool(options["linear_light"])}
     return iteration, found._replace(splats=cropped(found.splats, crop), **marks), options
 

@@ -6,7 +6,7 @@ orientation tag of EXIF is ignored: structure from motion saw the pixels as stor
 """
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import reduce
@@ -129,28 +129,28 @@ def read_pixels(path: Path, background: float) -> LoadedImage:
     spec = file.spec()
     kind, scale = (oiio.UINT8, 1 / 255) if spec.format.basetype == oiio.UINT8 else (oiio.FLOAT, 1.0)
     pixels = _decoded(path, file, kind) * np.float32(scale)  # as OpenImageIO does with bytes, in half of the time
-    color = pixels[..., :3] if spec.nchannels >= 3 else np.repeat(pixels[..., :1], 3, axis=-1)
-    if file.format_name() == "openexr":
-        color = pixels[..., _named_colors(path, spec.channelnames)]
-    linear, alpha = _is_linear(spec), pixels[..., spec.alpha_channel if spec.alpha_channel >= 0 else 0]
+    colors, behind = _channels(path, file)
+    linear, color, alpha = _is_linear(spec), pixels[..., colors], pixels[..., max(behind, 0)]
     if kind == oiio.FLOAT and not ((abs(color) < BRIGHTEST).all() and np.isfinite(alpha).all()):
         raise _unreadable(path, f"pixels that are NaN or beyond {BRIGHTEST:g}")
-    if spec.alpha_channel < 0:
+    if behind < 0:
         return LoadedImage(color, None, linear)
     straight = spec.get_int_attribute("oiio:UnassociatedAlpha")
     color = (color * alpha[..., None] if straight else color) + (1 - alpha[..., None]) * np.float32(background)
     return LoadedImage(color, alpha if alpha.min() < 1 else None, linear)
 
 
-def _named_colors(path: Path, channels: Sequence[str]) -> list[int]:
-    """Where red, green and blue are: without a layer's name, or of the only layer that has them; or where gray is."""
-    names = [name.upper() for name in channels]
+def _channels(path: Path, file: oiio.ImageInput) -> tuple[slice | list[int], int]:
+    """Where red, green and blue are, and alpha (-1: nowhere); in an EXR by name, where colors have names."""
+    spec = file.spec()
+    names = [name.upper() for name in spec.channelnames]
     layers = [layer for layer in sorted({name[:-1] for name in names}) if {*names} >= {layer + c for c in "RGB"}]
-    if layers and (not layers[0] or len(layers) == 1):
-        return [names.index(layers[0] + color) for color in "RGB"]
-    if {*names} <= {"Y", "A"}:
-        return [names.index("Y")] * 3
-    raise _unreadable(path, f"channels {few(channels)} instead of R, G, B")
+    if file.format_name() != "openexr" or not (layers or {"RY", "BY"} <= {*names}):
+        return slice(3) if len(names) >= 3 else [0, 0, 0], spec.alpha_channel
+    if not layers or (layers[0] and layers[1:]):
+        raise _unreadable(path, f"channels {few(spec.channelnames)} instead of R, G, B")
+    places = [names.index(layers[0] + color) for color in "RGB"]
+    return places, names.index(layers[0] + "A") if layers[0] + "A" in names else -1
 
 
 def _is_linear(spec: oiio.ImageSpec) -> bool:
@@ -319,8 +319,7 @@ def _open(path: Path) -> oiio.ImageInput:
     if pixels > PIXELS_MOST or spec.nchannels > CHANNELS_MOST or spec.depth > 1 or least > path.stat().st_size:
         raise _unreadable(path, f"{spec.width} x {spec.height} x {spec.depth} pixels of {spec.nchannels} channels")
     if file.format_name() == "openexr" and spec.roi != spec.roi_full:
-        whole = f"{spec.full_width} x {spec.full_height} pixels"
-        raise _unreadable(path, f"only {spec.width} x {spec.height} of {whole}: save it without a data window")
+        raise _unreadable(path, f"a data window that is not its picture of {spec.full_width} x {spec.full_height}")
     return file
 
 

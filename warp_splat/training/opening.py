@@ -150,14 +150,8 @@ def open_scene(config: TrainConfig, begun: Checkpoint | None, say: Say, processe
 
 
 def write_inputs(folder: Path, config: TrainConfig, scene: Scene, begun: Checkpoint | None) -> None:
-    """Write what this training was given: options, cameras, points. Models of before keep how they are drawn."""
+    """Write what this training was given: options, cameras, points."""
     config = config.changed(minutes=0.0)  # a clock cannot be repeated, what it decides can
-    before = model_folder.read_cfg_args(folder) if begun and (folder / "cfg_args").exists() else {}
-    drawn = {name: before[name] for name in COMMON if name in before}
-    if not drawn.items() <= config.flat().items():
-        for ply in folder.glob(model_folder.AS_SAVED):
-            if not (ply.parent / model_folder.DRAWN).exists():
-                model_folder.write_beside(ply, model_folder.DRAWN, drawn)
     model_folder.write_cfg_args(folder, {**config.flat(), "train_test_exp": False, "linear_light": scene.linear})
     write_config(folder, config)
     coordinates = scene.coordinates or (read_coordinates(begun.path.parent) if begun else None)

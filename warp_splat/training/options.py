@@ -220,6 +220,7 @@ FIXED_OPTIONS = {
     "optimizer_type": "the moments of one are not those of the other",
     "growth": "the statistics of one are not those of the other",
     "portable": "with it, kernels round otherwise",
+    **dict.fromkeys(("antialiasing", "projection", "white_background"), "models saved before are drawn with it"),
     "block": "its Gaussians are those of its block",
     "start_ply": "it goes on from its own Gaussians",
     "seed": "random numbers continue from the checkpoint's",

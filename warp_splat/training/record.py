@@ -70,12 +70,11 @@ def save_model(trainer: Trainer, run: Run) -> Path:
         behind = trainer.behind.cpu().numpy()
         model_folder.write_environment(path, behind if behind.ndim > 1 else None)
         write_exposures(path, trainer.exposures)
-        model_folder.write_beside(path, model_folder.DRAWN, None)  # by this training's
         if refined:
             model_folder.write_cameras(path.parent, *refined, scene.coordinates)
-        else:
-            (path.parent / model_folder.CAMERAS).unlink(missing_ok=True)
         trainer.save(path)
+        if not refined:
+            model_folder.write_beside(path, model_folder.CAMERAS, None)
 
     own = model_folder.ply_path("", run.iteration)
     path = save_somewhere(run.folder / own, save, str(own))
@@ -98,7 +97,7 @@ def _refined(trainer: Trainer) -> tuple[list[View], list[View]] | None:
     try:
         test, train = trainer.refined(scene.test), trainer.refined(scene.train)
     except (ValueError, ArithmeticError) as error:
-        warn(error)
+        warn(InputError(f"the refined cameras are not saved: {error}"))
         return None
     return None if train is scene.train else (test, train)
 
