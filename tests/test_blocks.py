@@ -5,7 +5,7 @@ import shutil
 
 import numpy as np
 import pytest
-from commands import SCENE, SHORT, interrupt, train
+from commands import SCENE, SHORT, interrupt, no_space, train
 from hostile import refusal, replace
 from scene_files import LENS, texture, write_image
 
@@ -117,7 +117,7 @@ WRONG = {
     "found another model": ((0, 1), lambda folder: (folder / LAST).touch()),
     "trainings by --block, found another model": (
         (0, 1),
-        lambda folder: shutil.copy(folder / "1" / "config.toml", folder),
+        lambda folder: shutil.copytree(folder / "1" / "point_cloud", folder / "point_cloud"),
     ),
     "found 0 of block 2/2": ((0,), None),
     "found 2 of block 1/2, 0 of block 2/2": ((0, "00"), None),
@@ -144,10 +144,16 @@ def test_a_merge_says_what_is_wrong(found, trained, tmp_path, fails):
     assert found in fails("merge", tmp_path)
 
 
-def test_no_gaussians_are_merged_without_what_they_are_drawn_with(trained, tmp_path, fails):
+def test_no_gaussians_are_merged_without_what_they_are_drawn_with(trained, tmp_path, fails, monkeypatch):
+    """Neither new ones nor, with what new ones are drawn with, those merged before."""
     put(trained, tmp_path, 0, 1)
-    (tmp_path / "input.ply").mkdir()
-    assert "input.ply" in fails("merge", tmp_path)
+    monkeypatch.setattr("warp_splat.scene.blocks.write_coordinates", no_space)
+    assert "no space left" in fails("merge", tmp_path)
+    assert not list(tmp_path.glob("point_cloud/*/*"))
+    monkeypatch.undo()
+    assert main(["merge", str(tmp_path)]) == 0
+    monkeypatch.setattr("warp_splat.scene.blocks.save_gaussians", no_space)
+    assert "no space left" in fails("merge", tmp_path)
     assert not list(tmp_path.glob("point_cloud/*/*"))
 
 
@@ -155,7 +161,7 @@ def test_blocks_are_not_trained_where_another_model_is(trained, tmp_path, fails)
     """Also one without a checkpoint."""
     ply = shutil.copytree(trained / "point_cloud", tmp_path / "point_cloud")
     words = "train", "-s", SCENE, "-m", tmp_path, *SHORT, "--blocks", "2"
-    assert "it already holds a model that was not merged of blocks; choose another with -m" in fails(*words)
+    assert "it already holds another model; move it away" in fails(*words)
     assert list(ply.glob("*/*.ply"))
 
 
@@ -202,7 +208,7 @@ def test_what_a_block_cannot_have(trained, tmp_path, fails, monkeypatch):
     for name, value in (("--block", "1/2"), ("--minutes", "1"), ("--resume", trained)):
         more = () if name == "--resume" else ("-s", SCENE)
         assert f"--blocks: expected no {name} beside it" in fails("train", *more, "--blocks", "2", name, value)
-    assert "it already holds a model that was not merged" in fails("train", "-s", SCENE, "--blocks", "2", "-m", trained)
+    assert "it already holds another model" in fails("train", "-s", SCENE, "--blocks", "2", "-m", trained)
     assert "expected another folder than the scene's" in fails("train", "-s", SCENE, "--blocks", "2", "-m", SCENE)
     monkeypatch.setenv("WORLD_SIZE", "2")
     assert "--blocks: expected one process" in fails("train", "-s", SCENE, "--blocks", "2")

@@ -189,13 +189,17 @@ def write_exr(path, channels, size=(WIDTH, HEIGHT)):
         ("Albedo.R Albedo.G Albedo.B R G B A", [4, 5, 6]),
         ("Y", [1, 1, 1]),
         ("V", [1, 1, 1]),
-        ("Y A", [1, 1, 1]),
+        ("Y A Z", [1, 1, 1]),
         ("Red Green Blue", [1, 2, 3]),
         ("R G B matte.B", [1, 2, 3]),
         (
             "Albedo.R Albedo.G Albedo.B L.R L.G L.B L.A",
-            r"channels Albedo\.R, Albedo\.G, Albedo\.B and 4 more instead of",
+            "R, G, B of one layer, found Albedo",
         ),
+        ("a.red a.green a.blue b.red b.green b.blue", "expected R, G, B of one layer"),
+        ("N.X N.Y N.Z", "expected R, G, B of one layer"),
+        ("RY BY Y", "expected R, G, B of one layer"),
+        ("R G", "expected R, G, B of one layer"),
     ],
 )
 def test_colors_of_an_exr_are_found_by_their_names(tmp_path, channels, found):
@@ -210,7 +214,7 @@ def test_colors_of_an_exr_are_found_by_their_names(tmp_path, channels, found):
 def test_an_exr_with_fewer_pixels_than_its_picture_is_refused(tmp_path):
     root = write_colmap(tmp_path, ["a.exr"])
     write_exr(root / "images" / "a.exr", ["R", "G", "B"], (WIDTH // 2, HEIGHT // 2))
-    refusal(lambda: load(root), f"a data window that is not its picture of {WIDTH} x {HEIGHT}")
+    refusal(lambda: load(root), "expected a data window that is its whole picture, found another")
 
 
 @pytest.mark.parametrize("channels", ["A", "V", "Y"])

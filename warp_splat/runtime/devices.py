@@ -21,12 +21,11 @@ def choose_device(name: str) -> torch.device:
     Raises:
         InputError: if "cuda" cannot be used here; the message says why and what to do.
     """
-    if name == "cpu":
-        return torch.device("cpu")
-    if (problem := why_no_cuda()) is None:
-        return torch.device("cuda", torch.cuda.current_device())
-    if name == "cuda":
-        raise InputError(f"--device cuda: {problem}, or use --device cpu.")
+    if name != "cpu":
+        if (problem := why_no_cuda()) is None:
+            return torch.device("cuda", torch.cuda.current_device())
+        if name == "cuda":
+            raise InputError(f"--device cuda: {problem}, or use --device cpu.")
     return torch.device("cpu")
 
 

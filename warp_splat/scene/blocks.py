@@ -101,12 +101,16 @@ def _block_of_json(facts: dict) -> Block:
 
 
 def holds_another(folder: Path) -> bool:
-    """Whether there is a training in a folder, or a model without blocks that it was merged of."""
+    """Whether there is a training in a folder, or a model that was not merged of the blocks there.
+
+    Raises:
+        InputError: if its cfg_args is damaged.
+    """
     from warp_splat.formats.checkpoint import LAST  # noqa: PLC0415 - torch takes seconds to load
 
-    if (folder / LAST).exists() or (folder / "config.toml").exists():
-        return True
-    return any(folder.glob(AS_SAVED)) and not any(folder.glob(f"*/{BLOCK}"))
+    options = read_cfg_args(folder) if (folder / "cfg_args").exists() else {}
+    merged = options.get("blocks") and any(folder.glob(f"*/{BLOCK}"))
+    return (folder / LAST).exists() or (any(folder.glob(AS_SAVED)) and not merged)
 
 
 def merge_blocks(config: MergeConfig) -> int:
@@ -149,9 +153,9 @@ def merge_blocks(config: MergeConfig) -> int:
     save_points(folder / "input.ply", *map(np.concatenate, zip(*clouds, strict=True)))
     write_json(folder / CAMERAS, [{**cameras[name], "id": index} for index, name in enumerate(sorted(cameras))])
     write_coordinates(folder, read_coordinates(places[0]))
-    write_cfg_args(folder, {**trained[0], "block": "", "model_path": str(folder)})
-    save_gaussians(path, merged)  # last: without the rest, they would be drawn otherwise
-    for old in {*folder.glob(AS_SAVED)} - {path}:  # merged before, from blocks of other lengths
+    for old in folder.glob(AS_SAVED):  # merged before
         old.unlink()
+    write_cfg_args(folder, {**trained[0], "block": "", "blocks": count, "model_path": str(folder)})
+    save_gaussians(path, merged)  # last: without the rest, they would be drawn otherwise
     print(f"{path}: {len(merged.splats.means)} Gaussians of {count} blocks")
     return 0

@@ -6,6 +6,7 @@ orientation tag of EXIF is ignored: structure from motion saw the pixels as stor
 """
 
 import math
+import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -21,7 +22,6 @@ from scipy.ndimage import map_coordinates, maximum_filter, minimum_filter
 from warp_splat.camera import Camera
 from warp_splat.errors import InputError, reason_of, refusing
 from warp_splat.scene.types import Decoded
-from warp_splat.text import few
 
 THREADS = 2  # OpenImageIO releases the GIL; more threads hold more decoded photographs in memory
 AUTO_WIDTH = 1600  # `-r -1` shrinks wider images to this width (graphdeco, utils/camera_utils.py)
@@ -141,16 +141,19 @@ def read_pixels(path: Path, background: float) -> LoadedImage:
 
 
 def _channels(path: Path, file: oiio.ImageInput) -> tuple[slice | list[int], int]:
-    """Where red, green and blue are, and alpha (-1: nowhere); in an EXR by name, where colors have names."""
+    """Where red, green and blue are, and alpha (-1: nowhere): by name in an EXR of several channels or parts."""
     spec = file.spec()
-    names = [name.upper() for name in spec.channelnames]
+    if file.format_name() != "openexr" or max(spec.nchannels, spec.get_int_attribute("oiio:subimages")) == 1:
+        return slice(3) if spec.nchannels >= 3 else [0, 0, 0], spec.alpha_channel
+    names = [re.sub("RED$|GREEN$|BLUE$|ALPHA$", lambda word: word[0][0], name.upper()) for name in spec.channelnames]
     layers = [layer for layer in sorted({name[:-1] for name in names}) if {*names} >= {layer + c for c in "RGB"}]
-    if file.format_name() != "openexr" or not (layers or {"RY", "BY"} <= {*names}):
-        return slice(3) if len(names) >= 3 else [0, 0, 0], spec.alpha_channel
-    if not layers or (layers[0] and layers[1:]):
-        raise _unreadable(path, f"channels {few(spec.channelnames)} instead of R, G, B")
-    places = [names.index(layers[0] + color) for color in "RGB"]
-    return places, names.index(layers[0] + "A") if layers[0] + "A" in names else -1
+    colors = "RGB" if layers else "YYY"  # gray, or luminance beside chroma
+    if (layers[1:] and layers[0]) or not (layers or ("Y" in names and not {"RY", "BY"} & {*names})):
+        raise InputError(
+            f"{path}: expected R, G, B of one layer, found {', '.join(spec.channelnames):.80}; save those."
+        )
+    layer = min(layers, default="")
+    return [names.index(layer + c) for c in colors], names.index(layer + "A") if layer + "A" in names else -1
 
 
 def _is_linear(spec: oiio.ImageSpec) -> bool:
@@ -319,7 +322,7 @@ def _open(path: Path) -> oiio.ImageInput:
     if pixels > PIXELS_MOST or spec.nchannels > CHANNELS_MOST or spec.depth > 1 or least > path.stat().st_size:
         raise _unreadable(path, f"{spec.width} x {spec.height} x {spec.depth} pixels of {spec.nchannels} channels")
     if file.format_name() == "openexr" and spec.roi != spec.roi_full:
-        raise _unreadable(path, f"a data window that is not its picture of {spec.full_width} x {spec.full_height}")
+        raise InputError(f"{path}: expected a data window that is its whole picture, found another; save all of it.")
     return file
 
 

@@ -67,7 +67,7 @@ def _train_blocks(config: TrainConfig) -> int:
     if int(os.environ.get("WORLD_SIZE", "1")) > 1:
         raise InputError(f"--blocks: expected one process; let torchrun train one of them (--block 1/{count}).")
     if holds_another(folder):
-        raise InputError(f"{folder}: it already holds a model that was not merged of blocks; choose another with -m.")
+        raise InputError(f"{folder}: it already holds another model; move it away, or choose another folder with -m.")
     opening.check_folder(config, folder)
     say, numbers = opening.speaker(config.report.quiet), range(1, count + 1)
     for number in numbers:
