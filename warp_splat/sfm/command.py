@@ -126,10 +126,9 @@ def _claim(source: Path, scene: Path, config: SfmConfig) -> Path:
                 f"be written over; choose another, such as {scene_of(scene)}."
             )
         if not (files := [(name, root / name) for name in find_files(root, PHOTOS, scene)]):
-            videos = find_files(root, VIDEOS)
-            hint = f"name the video itself: {shlex.quote(str(root / videos[0]))}" if videos else "check the path"
-            expected = f"expected photographs ({', '.join(PHOTOS)})"
-            raise InputError(f"{source}: {expected}, found none; {jpeg_hint(source) or hint}.")
+            hints = [f"name the video itself: {shlex.quote(str(root / name))}" for name in find_files(root, VIDEOS)]
+            hint = jpeg_hint(source) or (hints or ["check the path"])[0]
+            raise InputError(f"{source}: expected photographs ({', '.join(PHOTOS)}), found none; {hint}.")
     else:
         files = [(source.name, source)]
     record = json.dumps({"options": options, "files": {name: path.stat().st_size for name, path in files}}, indent=1)

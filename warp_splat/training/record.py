@@ -93,13 +93,12 @@ def save_model(trainer: Trainer, run: Run) -> Path:
 
 def _refined(trainer: Trainer) -> tuple[list[View], list[View]] | None:
     """Test and training views with the cameras that were learned; None if none were, or they are not finite."""
-    scene = trainer.scene
     try:
-        test, train = trainer.refined(scene.test), trainer.refined(scene.train)
+        test, train = trainer.refined(trainer.scene.test), trainer.refined(trainer.scene.train)
     except (ValueError, ArithmeticError) as error:
         warn(InputError(f"the refined cameras are not saved: {error}"))
         return None
-    return None if train is scene.train else (test, train)
+    return None if train is trainer.scene.train else (test, train)
 
 
 def save_or_warn(trainer: Trainer, run: Run) -> None:
