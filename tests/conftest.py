@@ -35,7 +35,10 @@ from warp_splat.scene.embedded import embedded_scene
 pool.SMALLEST_SLICE = 256  # so that threads share small scenes, too
 report.DPI = page.PAGE_DPI = 50  # so that pictures take a third of the time
 new_figure = report.new_figure
-report.new_figure = lambda width, height, layout=None: new_figure(width, height)  # finding room takes the most of it
+#: Without a search for room, which takes the most of it.
+report.new_figure = lambda width, height, layout=None: new_figure(
+    width, height, layout if layout != "constrained" else None
+)
 # Tests start dozens of processes: what one has compiled of torch serves the next.
 sys.dont_write_bytecode = False
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
