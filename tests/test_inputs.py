@@ -26,7 +26,7 @@ from warp_splat.errors import InputError
 from warp_splat.formats.exchange import save_gaussians
 from warp_splat.formats.model_folder import ply_path
 from warp_splat.scene import load_scene
-from warp_splat.scene.images import read_mask
+from warp_splat.scene.images import read_kind, read_mask
 from warp_splat.training.loss import image_loss
 from warp_splat.training.options import TrainConfig
 from warp_splat.training.trainer import Trainer
@@ -214,7 +214,16 @@ def test_colors_of_an_exr_are_found_by_their_names(tmp_path, channels, found):
 def test_an_exr_with_fewer_pixels_than_its_picture_is_refused(tmp_path):
     root = write_colmap(tmp_path, ["a.exr"])
     write_exr(root / "images" / "a.exr", ["R", "G", "B"], (WIDTH // 2, HEIGHT // 2))
-    refusal(lambda: load(root), "expected a data window that is its whole picture, found another")
+    refusal(lambda: load(root), "expected a flat EXR whose data window is its picture, found another")
+
+
+def test_a_deep_exr_is_refused(tmp_path):
+    """Of which only parts would be read into memory that held something else."""
+    spec, data, file = oiio.ImageSpec(4, 4, 3, oiio.FLOAT), oiio.DeepData(), oiio.ImageOutput.create("a.exr")
+    spec.deep = True
+    data.init(16, 3, [oiio.FLOAT] * 3, ["R", "G", "B"])
+    assert file.open(str(tmp_path / "a.exr"), spec) and file.write_deep_image(data) and file.close()
+    refusal(lambda: read_kind(tmp_path / "a.exr"), "expected a flat EXR")
 
 
 @pytest.mark.parametrize("channels", ["A", "V", "Y"])
@@ -226,6 +235,7 @@ def test_masks_in_an_exr_have_one_channel_of_any_name(tmp_path, channels):
 def test_alpha_of_an_exr_is_that_of_its_colors(tmp_path):
     root = write_colmap(tmp_path, ["a.exr"])
     write_exr(root / "images" / "a.exr", ["R", "G", "B", "cut.A"])
+    assert not read_kind(root / "images" / "a.exr")[1]
     found = load(root)[0].train[0]
     assert found.alpha is None and (found.image == np.float32([1, 2, 3]) / 8).all()
 

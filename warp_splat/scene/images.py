@@ -166,8 +166,8 @@ def read_kind(path: Path) -> tuple[bool, bool]:
     Raises:
         InputError: if the file is not an image that OpenImageIO reads.
     """
-    spec = _open(path).spec()
-    return _is_linear(spec), spec.alpha_channel >= 0
+    file = _open(path)
+    return _is_linear(file.spec()), _channels(path, file)[1] >= 0
 
 
 def read_mask(path: Path, size: tuple[int, int], invert: bool) -> np.ndarray:
@@ -321,8 +321,8 @@ def _open(path: Path) -> oiio.ImageInput:
     pixels, least = spec.width * spec.height, spec.image_bytes() // RATIO_MOST
     if pixels > PIXELS_MOST or spec.nchannels > CHANNELS_MOST or spec.depth > 1 or least > path.stat().st_size:
         raise _unreadable(path, f"{spec.width} x {spec.height} x {spec.depth} pixels of {spec.nchannels} channels")
-    if file.format_name() == "openexr" and spec.roi != spec.roi_full:
-        raise InputError(f"{path}: expected a data window that is its whole picture, found another; save all of it.")
+    if file.format_name() == "openexr" and (spec.deep or spec.roi != spec.roi_full):
+        raise InputError(f"{path}: expected a flat EXR whose data window is its picture, found another; save it so.")
     return file
 
 
