@@ -7,6 +7,7 @@ import OpenImageIO as oiio
 import pytest
 import torch
 from hostile import refusal
+from PIL import Image
 from scene_files import (
     HEIGHT,
     WIDTH,
@@ -26,7 +27,7 @@ from warp_splat.errors import InputError
 from warp_splat.formats.exchange import save_gaussians
 from warp_splat.formats.model_folder import ply_path
 from warp_splat.scene import load_scene
-from warp_splat.scene.images import read_kind, read_mask
+from warp_splat.scene.images import read_kind, read_mask, read_pixels
 from warp_splat.training.loss import image_loss
 from warp_splat.training.options import TrainConfig
 from warp_splat.training.trainer import Trainer
@@ -200,6 +201,7 @@ def write_exr(path, channels, size=(WIDTH, HEIGHT)):
         ("N.X N.Y N.Z", "expected R, G, B of one layer"),
         ("RY BY Y", "expected R, G, B of one layer"),
         ("R G", "expected R, G, B of one layer"),
+        ("X Y Z", "expected R, G, B of one layer"),
     ],
 )
 def test_colors_of_an_exr_are_found_by_their_names(tmp_path, channels, found):
@@ -215,6 +217,13 @@ def test_an_exr_with_fewer_pixels_than_its_picture_is_refused(tmp_path):
     root = write_colmap(tmp_path, ["a.exr"])
     write_exr(root / "images" / "a.exr", ["R", "G", "B"], (WIDTH // 2, HEIGHT // 2))
     refusal(lambda: load(root), "expected a flat EXR whose data window is its picture, found another")
+
+
+def test_a_gif_is_read(tmp_path):
+    """OpenImageIO says that alpha is in a channel that is not there."""
+    Image.new("RGB", (4, 3), (51, 102, 153)).save(tmp_path / "a.gif")
+    found = read_pixels(tmp_path / "a.gif", 1.0)
+    assert found.alpha is None and np.abs(found.color * 255 - [51, 102, 153]).max() < 1e-4
 
 
 def test_a_deep_exr_is_refused(tmp_path):

@@ -144,11 +144,11 @@ def _channels(path: Path, file: oiio.ImageInput) -> tuple[slice | list[int], int
     """Where red, green and blue are, and alpha (-1: nowhere): by name in an EXR of several channels or parts."""
     spec = file.spec()
     if file.format_name() != "openexr" or max(spec.nchannels, spec.get_int_attribute("oiio:subimages")) == 1:
-        return slice(3) if spec.nchannels >= 3 else [0, 0, 0], spec.alpha_channel
+        return slice(3) if spec.nchannels >= 3 else [0, 0, 0], min(spec.alpha_channel, spec.nchannels - 1)
     names = [re.sub("RED$|GREEN$|BLUE$|ALPHA$", lambda word: word[0][0], name.upper()) for name in spec.channelnames]
     layers = [layer for layer in sorted({name[:-1] for name in names}) if {*names} >= {layer + c for c in "RGB"}]
     colors = "RGB" if layers else "YYY"  # gray, or luminance beside chroma
-    if (layers[1:] and layers[0]) or not (layers or ("Y" in names and not {"RY", "BY"} & {*names})):
+    if (layers[1:] and layers[0]) or not (layers or ("Y" in names and not {"RY", "BY", "X"} & {*names})):
         raise InputError(
             f"{path}: expected R, G, B of one layer, found {', '.join(spec.channelnames):.80}; save those."
         )
