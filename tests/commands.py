@@ -54,11 +54,16 @@ def started(*words, **pipes):
     return subprocess.Popen([sys.executable, *map(str, words)], env=environment_of(), **pipes)
 
 
-def forked_process(target, *arguments):
-    """One that runs, from one that has loaded what a training needs."""
+def forking():
+    """Processes of Python that come from one that has loaded what a training needs."""
     processes = multiprocessing.get_context("forkserver")
     processes.set_forkserver_preload(["warp_splat.training.command"])
-    process = processes.Process(target=target, args=arguments)
+    return processes
+
+
+def forked_process(target, *arguments):
+    """One that runs."""
+    process = forking().Process(target=target, args=arguments)
     process.start()
     return process
 

@@ -20,6 +20,7 @@ import torch
 import wrong_renderer
 from audit_targets import own
 from browser import CHROMIUM
+from commands import forking
 
 from warp_splat.audit import program
 from warp_splat.audit.judged import RUNS, SceneRow, exact_image, measure
@@ -34,6 +35,13 @@ from warp_splat.formats.png import load_png
 
 USUAL = {"blur": 0.3, "antialiasing": False, "alpha_min": 1 / 255, "alpha_max": 0.99, "t_min": 1e-4, "near": 0.2}
 USUAL["projection"] = "affine"
+
+
+@pytest.fixture(autouse=True)
+def forked(monkeypatch):
+    """Renderers need not load anew what they draw with."""
+    processes = forking()
+    monkeypatch.setattr("multiprocessing.get_context", lambda method: processes)
 
 
 def rules_of(eight_bit=False, **broken):
