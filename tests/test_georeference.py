@@ -35,15 +35,17 @@ UTM = np.array([691_000.25, 5_335_000.5, 520.0])
 COUNT = 16
 
 
-def model_of(centers, random, down=False):
-    """Cameras at centers [N, 3] (x east, y north, z up) that look level, or down, in another frame."""
+def model_of(centers, random, down=False, ahead=None):
+    """Cameras at centers [N, 3] (x east, y north, z up) that look level, down or ``ahead`` [3], in another frame."""
     model = pycolmap.Reconstruction()
     lens = pycolmap.Camera(camera_id=1, model="PINHOLE", width=8, height=8, params=[8, 8, 4, 4])
     model.add_camera_with_trivial_rig(lens)
     for index, center in enumerate(centers):
-        forward = np.append(random.normal(size=2), 0.0)
-        forward /= np.linalg.norm(forward)
-        rotation = np.stack([np.cross(forward, (0, 0, 1)), (0, 0, -1), forward])
+        forward = np.append(random.normal(size=2), 0.0) if ahead is None else np.array(ahead)
+        forward = forward / np.linalg.norm(forward)
+        below = forward[2] * forward - (0, 0, 1)
+        below /= np.linalg.norm(below)
+        rotation = np.stack([np.cross(below, forward), below, forward])
         if down:
             rotation = np.stack([rotation[0], -forward, (0, 0, -1)])
         pose = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), -rotation @ center)
@@ -81,6 +83,37 @@ def test_positions_place_a_model_and_outliers_are_left_out(tmp_path, along):
     )
     down = np.array([model.image(i + 1).cam_from_world().rotation.matrix()[1] for i in range(COUNT)])
     np.testing.assert_allclose(down, np.broadcast_to((0, 1, 0), down.shape), atol=0.01)
+
+
+@pytest.mark.parametrize(
+    ("spans", "ahead", "noise", "wrong", "line"),
+    [
+        ((20, 20, 0), (0, 1, 0), 0.0, 0, False),  # z is 520 m everywhere
+        ((20, 0, 0), (0, 1, 0), 0.0, 0, True),
+        ((100, 0, 0), (1, 0, -0.5), 0.02, 0, True),
+        ((100, 0, 10), (1, 0, -0.1), 0.02, 9, True),
+        ((250, 12, 0), (0, 1, -1), 0.03, 9, False),  # what leaves the line by 25 m tells up
+        ((60, 2, 0), (1, 0, 0), 2.0, 0, True),  # but not if positions err by more
+    ],
+)
+def test_what_positions_do_not_tell_cameras_do(tmp_path, spans, ahead, noise, wrong, line):
+    """Whole meters, lines and cameras that look down ahead; 9 of 30 positions are wrong."""
+    random, count, told = np.random.default_rng(3), 30, []
+    centers = np.linspace(-1, 1, count)[:, None] * spans * (1, 0, 1) + random.uniform(-1, 1, (count, 1)) * (
+        0,
+        spans[1],
+        0,
+    )
+    positions = centers + UTM.round() + noise * random.normal(size=centers.shape)
+    positions[:wrong] += 60 * random.normal(size=(wrong, 3))
+    model = model_of(centers, random, ahead=ahead)
+    found = georeference(model, tmp_path, write_positions(tmp_path / "a.csv", positions), 0, told.append)
+    turned = np.stack([model.image(i + 1).cam_from_world().rotation.matrix()[2] for i in range(count)])
+    off = turned @ MODEL_FROM_WORLD - np.array(ahead) / np.linalg.norm(ahead)
+    local = np.array([model.image(i + 1).projection_center() for i in range(count)])
+    assert np.abs(off).max() < max(1e-3, 0.1 * noise), off
+    assert np.abs(local @ MODEL_FROM_WORLD + found["origin"] - centers - UTM.round()).max() < 2 * noise + 1e-4
+    assert ("from the photographs" in told[0]) == line and {f"{i}.jpg" for i in range(wrong)} <= {*found["left_out"]}
 
 
 @pytest.mark.parametrize("looks", ["level", "down"])

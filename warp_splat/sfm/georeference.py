@@ -6,6 +6,7 @@ import csv
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from warp_splat.errors import InputError
 from warp_splat.formats.coordinates import AXES, MODEL_FROM_WORLD
@@ -22,7 +23,9 @@ COARSE = 0.1  # of the extent: GPS that errs by more is not taken
 USUAL = 5.0  # units: half of what photographs show is farther away, where nothing tells the scale
 TURNED = 0.7  # cosine: of where photographs have their top, or look, against up
 DOUBT = " (photographs stand upside down there, or look up: are x and y exchanged?)"  # flat positions fit turned over
-LINE = 0.1  # share of the extent that positions leave a straight line by, below which they do not tell up
+LINE = " (up from the photographs, as positions lie along a line)"
+UNSURE = 0.1  # radians: of a turn about the line along which positions lie, above which they do not tell up
+NUDGE = 1e-7  # of their size: without it, pycolmap finds nothing for points on a line, or on a plane through 0
 
 
 def georeference(model: pycolmap.Reconstruction, database: Path, source: str, seed: int, say: Report) -> dict | None:
@@ -45,7 +48,7 @@ def georeference(model: pycolmap.Reconstruction, database: Path, source: str, se
     images = {image.name: image for image in map(model.image, model.reg_image_ids())}
     centers = {name: image.projection_center() for name, image in images.items()}
     axes = np.mean([image.cam_from_world().rotation.matrix() for image in images.values()], axis=0)
-    up = -axes[1] / np.linalg.norm(axes[1])
+    up = -axes[1]
     if source == "none":
         return None
     if source != "auto":
@@ -67,7 +70,7 @@ def georeference(model: pycolmap.Reconstruction, database: Path, source: str, se
         )
     world = np.array([known[name] for name in names])
     origin = np.round(np.median(world, axis=0))
-    fitted, residuals, right = fit(np.array([centers[name] for name in names]), world - origin, up, seed)
+    fitted, residuals, right, line = fit(np.array([centers[name] for name in names]), world - origin, up, seed)
     extent = _extent(world[right])
     error = float(np.median(residuals[right])) if right.any() else np.inf
     if right.sum() < max(LEAST, len(names) / 2) or error > COARSE * extent:
@@ -81,6 +84,7 @@ def georeference(model: pycolmap.Reconstruction, database: Path, source: str, se
     rest = f"; left out: {few(left_out)}" if left_out else ""
     rest += "; three always fit: give more" * int(right.sum() == LEAST)
     tops, ahead = np.stack([-axes[1], axes[2]]) @ fitted.rotation.matrix()[2]
+    reference += LINE * line
     reference += DOUBT if tops < -TURNED or (tops < TURNED and ahead > TURNED) else ""
     say(f"coordinates: {reference}, {right.sum()} positions fit within {error:.2g} m (median){rest}")
     return _described(origin, reference, fitted.scale, dict(zip(names, residuals.tolist(), strict=True)), left_out)
@@ -101,29 +105,36 @@ def scale_as_usual(model: pycolmap.Reconstruction) -> None:
 
 def fit(
     centers: np.ndarray, world: np.ndarray, up: np.ndarray, seed: int
-) -> tuple[pycolmap.Sim3d, np.ndarray, np.ndarray]:
+) -> tuple[pycolmap.Sim3d, np.ndarray, np.ndarray, bool]:
     """The similarity that takes camera centers [N, 3] to positions [N, 3], robustly.
 
-    Positions along a line leave a turn about it open: ``up`` [3] of the cameras, which goes to z, then closes it.
+    Positions along a line leave a turn about it open, as far as they err: ``up`` [3] of the cameras, which goes to z,
+    then closes it.
 
     Returns:
-        The similarity; residuals [N] in the unit of ``world``; which positions were taken for right [N].
+        The similarity; residuals [N] in the unit of ``world``; which positions were taken for right [N]; whether these
+        lie along a line.
     """
-    spans = np.linalg.svd(centers - centers.mean(0), compute_uv=False)
-    pairs = centers, world
-    if spans[1] < LINE * spans[0]:  # the same points again, lifted
-        apart = [np.linalg.norm(each - np.roll(each, len(each) // 2, axis=0), axis=1) for each in pairs]
-        lift, scale = _extent(centers), np.median(apart[1] / np.maximum(apart[0], 1e-9))
-        pairs = np.concatenate([centers, centers + lift * up]), np.concatenate([world, world + scale * lift * UP])
+    nudges = NUDGE * np.random.default_rng(seed).normal(size=(2, *world.shape))
+    sizes = [np.median(np.linalg.norm(each - np.median(each, axis=0), axis=1)) for each in (centers, world)]
+    nudged, to = centers + sizes[0] * nudges[0], world + sizes[1] * nudges[1]
     options = pycolmap.RANSACOptions(max_error=LOOSE * _extent(world) or 1.0, random_seed=seed)
-    found = pycolmap.estimate_sim3d_robust(*pairs, options)
-    right = np.asarray(found["inlier_mask"]) if isinstance(found, dict) else np.ones(len(pairs[0]), bool)
-    fitted, residuals = pycolmap.Sim3d(), np.zeros(len(pairs[0]))
+    found = pycolmap.estimate_sim3d_robust(nudged, to, options)
+    right = np.asarray(found["inlier_mask"]) if isinstance(found, dict) else np.ones(len(world), bool)
+    fitted, residuals = pycolmap.Sim3d(), np.zeros(len(world))
     for _ in range(3):  # again, with the spread of those that fit
-        fitted = pycolmap.estimate_sim3d(pairs[0][right], pairs[1][right]) or fitted
-        residuals = np.linalg.norm(fitted * pairs[0] - pairs[1], axis=1)
+        fitted = pycolmap.estimate_sim3d(nudged[right], to[right]) or fitted
+        residuals = np.linalg.norm(fitted * centers - world, axis=1)
         right = residuals <= OUTLIER * 1.4826 * np.median(residuals[right]) + 1e-9 * _extent(world)
-    return fitted, residuals[: len(world)], right[: len(world)]
+    middle = centers[right].mean(0)
+    _, spans, (along, *_) = np.linalg.svd(centers[right] - middle)
+    unsure = np.median(residuals[right]) + 10 * NUDGE * _extent(world[right])
+    if line := bool(unsure > UNSURE * fitted.scale * spans[1]):
+        ends = [fitted.rotation * along, UP], [along, up]
+        turned = pycolmap.Rotation3d(Rotation.align_vectors(*ends, weights=[np.inf, 1.0])[0].as_matrix())
+        fitted = pycolmap.Sim3d(fitted.scale, turned, fitted * middle - fitted.scale * (turned * middle))
+        residuals = np.linalg.norm(fitted * centers - world, axis=1)
+    return fitted, residuals, right, line
 
 
 def _extent(points: np.ndarray) -> float:
@@ -142,8 +153,7 @@ def _by_distances(model, centers: dict, up: np.ndarray, rows: list, source: str,
     if (miss := float(np.median(off / true))) > COARSE:
         raise InputError(f"{source}: expected distances that fit the cameras, found {miss:.0%} off (median); check it.")
     say(f"coordinates: {Path(source).name}, {len(off)} distances fit within {np.median(off):.2g} m (median)")
-    side = np.cross(up, np.eye(3)[np.abs(up).argmin()])
-    level = np.stack([side / np.linalg.norm(side), np.cross(up, side) / np.linalg.norm(side), up])
+    level = Rotation.align_vectors([UP], [up])[0].as_matrix()
     _move(model, pycolmap.Sim3d(scale, pycolmap.Rotation3d(level), -scale * level @ places.mean(0)))
     residuals = {f"{a} to {b}": float(r) for (a, b, _), r in zip(known, off, strict=True)}
     return _described(np.zeros(3), Path(source).name, scale, residuals, [])
