@@ -1,13 +1,16 @@
 """Formats of Gaussians: bytes against what their documents say, axes, round trips, what is lost, and renders."""
 
 import errno
+import os
+import signal
 import struct
+import sys
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import changes_told, full_disk, python
+from commands import changes_told, forked_process, full_disk, python
 from common import picture_of
 from hostile import refusal
 from scenes import C0
@@ -158,6 +161,20 @@ def test_a_full_disk_leaves_no_part_of_a_file(tmp_path, ending, left):
     with full_disk(left % size):
         refusal(write, str(tmp_path), "could not be written")
     assert not list(tmp_path.iterdir())
+
+
+def ended_while_it_writes(number, *arguments):
+    """A command that a signal reaches once its file is written, before that has its name."""
+    os.replace = lambda *_: os.kill(os.getpid(), number)
+    sys.exit(main([*arguments]))
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_leaves_no_part_of_a_file(tmp_path, number):
+    save_gaussians(tmp_path / "a.ply", some_file(9))
+    process = forked_process(ended_while_it_writes, number, "convert", f"{tmp_path}/a.ply", f"{tmp_path}/b.ply")
+    process.join()
+    assert process.exitcode == 130 and [path.name for path in tmp_path.iterdir()] == ["a.ply"]
 
 
 @pytest.mark.parametrize("encoding", ["ascii", pytest.param("latin-1", marks=pytest.mark.slow)])

@@ -6,7 +6,7 @@ import tomllib
 
 import numpy as np
 import pytest
-from commands import SCENE
+from commands import SCENE, no_space
 from hostile import refusal
 from trainings import begin, state_of, stepped, steps
 
@@ -277,6 +277,15 @@ def test_a_whole_training_by_the_clock_is_repeated_by_its_options(tmp_path, caps
     first, again = (json.loads((tmp_path / name / "history.json").read_text()) for name in "ab")
     assert [{**record, "seconds": 0} for record in first] == [{**record, "seconds": 0} for record in again]
     assert len(first) <= max(options["iterations"] // 50, 1)  # evaluations take no large part of so short a time
+
+
+@pytest.mark.slow
+def test_a_full_disk_costs_no_step_of_the_cooldown(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("warp_splat.training.record.write_config", no_space)
+    common = ["train", "-s", str(SCENE), "-m", str(tmp_path), "-r", "8", "--parts", "", "--minutes", "0.01"]
+    assert main(common) == 1
+    (*_, last) = json.loads((tmp_path / "history.json").read_text())  # written once all steps are done
+    assert "no space left" in capsys.readouterr().err and ply_path(tmp_path, last["iteration"]).exists()
 
 
 def test_a_shape_has_to_fit_its_iterations(scene):

@@ -23,6 +23,7 @@ from warp_splat.formats.model_folder import ply_path
 from warp_splat.formats.ply import save_ply
 from warp_splat.formats.png import load_png, save_png, save_video
 from warp_splat.text import format_table, table_of
+from warp_splat.training.tensorboard import EventLog
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -339,6 +340,18 @@ def test_event_files_hold_every_loss(told):
     assert found["gaussians"] == {record["iteration"]: record["gaussians"] for record in history}
     results = json.loads((told / "results.json").read_text())["ours_20"]
     assert found["test/FLIP"][20] == pytest.approx(results["FLIP"])
+
+
+def test_curves_end_where_the_disk_is_full(tmp_path, capsys):
+    """And do not keep the training waiting for a thread that has died."""
+    pytest.importorskip("tensorboardX")
+    log = EventLog(tmp_path)
+    with full_disk(2000):
+        for _ in range(9):
+            log.write((step, "train/loss", 0.5) for step in range(99))
+    assert capsys.readouterr().err == "warning: --tensorboard: no more curves are written (File too large).\n"
+    (file,) = tmp_path.iterdir()
+    assert file.stat().st_size == 2000
 
 
 @pytest.mark.parametrize(

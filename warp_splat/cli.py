@@ -15,7 +15,7 @@ from warp_splat import __version__, config
 from warp_splat.errors import InputError, tell
 from warp_splat.flags import FOREIGN_FLAGS, check_numbers, default_of, flags_of, purpose_of
 from warp_splat.presets import EMBEDDED_DEFAULTS, PRESETS
-from warp_splat.runtime.interrupts import leaving_at_once
+from warp_splat.runtime.interrupts import ending_as_by_ctrl_c, leaving_at_once
 from warp_splat.training.options import FIXED_OPTIONS, TrainConfig, check_train
 from warp_splat.training.parts import AUTO, PARTS
 
@@ -216,7 +216,8 @@ def main(arguments: list[str] | None = None) -> int:
             place = next(place for kind, place in COMMANDS.values() if isinstance(options, kind))
             run = pkgutil.resolve_name(f"warp_splat.{place}")
         alike = False
-        return run(options)
+        with ending_as_by_ctrl_c():
+            return run(options)
     except (InputError, OSError) as error:
         if not alike:
             tell(error)

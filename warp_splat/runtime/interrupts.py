@@ -30,6 +30,11 @@ def interruptible() -> Iterator[list[int]]:
         yield interrupted
 
 
+def ending_as_by_ctrl_c() -> AbstractContextManager[None]:
+    """Let SIGTERM raise as Ctrl-C does, so that what is half written goes, and what is measured is kept."""
+    return _handling((signal.SIGTERM,), signal.default_int_handler)
+
+
 def leaving_at_once() -> AbstractContextManager[None]:
     """Let Ctrl-C end the process instead of raising: in libraries that are half loaded, exceptions become others."""
     return _handling((signal.SIGINT,), lambda number, frame: leave("warp-splat: interrupted before it began."))

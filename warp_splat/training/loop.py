@@ -16,7 +16,6 @@ from tqdm import tqdm
 from warp_splat.errors import InputError
 from warp_splat.formats.png import save_png
 from warp_splat.runtime import timers
-from warp_splat.training.config_file import write_config
 from warp_splat.training.deadline import APART, Deadline
 from warp_splat.training.record import Run, keep, save_or_warn, warn
 from warp_splat.training.trainer import Trainer
@@ -58,8 +57,6 @@ def train_steps(trainer: Trainer, run: Run, interrupted: list[int], viewer: "Tra
             if trainer.config.learn.minutes and (cooldown := deadline.due(iteration, run.spent, processes)):
                 trainer.settle(iteration + 1, cooldown)
                 bar.total = trainer.config.learn.end
-                if processes.rank == 0:
-                    write_config(run.folder, trainer.config)
             if report.viewer:
                 trainer.lead(lambda: viewer and viewer.between_steps(interrupted))
     run.dropped = trainer.all_dropped()

@@ -25,7 +25,7 @@ from warp_splat.scene.photos import scene_of
 from warp_splat.scene.types import Scene
 from warp_splat.training.config_file import load_options, write_config
 from warp_splat.training.options import FIXED_OPTIONS, TrainConfig
-from warp_splat.training.tensorboard import writer_class
+from warp_splat.training.tensorboard import tensorboard_library
 
 Say = Callable[[str], None]
 OF_SCENE = ("images", "resolution", "white_background", "eval", "invert_masks", "lens", "block")  # load_scene's options
@@ -47,7 +47,7 @@ def resolve(config: TrainConfig, processes: Processes) -> tuple[TrainConfig, Che
     threads = machine.threads or max(1, pool.get_threads() // processes.local_count)
     choose_metrics(config.report.lpips_weights)  # what would be missed at the end is said now
     if config.report.tensorboard:
-        writer_class()
+        tensorboard_library()
     if machine.portable and not PORTABLE:
         raise InputError("portable: expected to be set before kernels are loaded; set WARP_SPLAT_PORTABLE=1 instead.")
     # whole, without its arrays: beside the trainer's they would take as much memory again

@@ -26,7 +26,7 @@ from warp_splat.runtime.distributed import Processes
 from warp_splat.scene.blocks import write_block
 from warp_splat.scene.types import View
 from warp_splat.text import format_table
-from warp_splat.training.config_file import OF_ONE_RUN
+from warp_splat.training.config_file import OF_ONE_RUN, write_config
 from warp_splat.training.plan import as_flags
 from warp_splat.training.seams import having
 from warp_splat.training.tensorboard import EventLog
@@ -176,6 +176,8 @@ def finish(trainer: Trainer, run: Run, say: Callable[[str], None]) -> None:
     if split == "train" and len(views) < len(trainer.scene.train):
         say(f"Evaluating {len(views)} of {len(trainer.scene.train)} training views (--eval holds some out instead).")
     write_json(run.folder / "history.json", run.history)  # now, since the evaluation may fail
+    if (decided := trainer.config.learn.settle_from_iter) > 1:  # by a clock, maybe; 1: blocks, together
+        write_config(run.folder, trainer.config)
     plot = run.folder / "training.png"
     if run.history:  # none, if it was stopped before the first evaluation and goes no further
         report.plot_training(plot, run.history, split)
@@ -214,12 +216,11 @@ def finish(trainer: Trainer, run: Run, say: Callable[[str], None]) -> None:
         for what, name in names.items():
             print(f"  {what:9s} {run.folder / name}")
     run.events.write((run.iteration, f"{split}/{name}", value) for name, value in means.items())
-    run.events.close()
     if run.stages:
         total = sum(run.stages.values())
         rows = [(name, f"{value:.2f}", f"{100 * value / total:.0f} %") for name, value in run.stages.items()]
         say(format_table(("stage", "ms per step", "share"), [*rows, ("whole step", f"{total:.2f}", "")]))
-    if trainer.config.learn.settle_from_iter > 1:  # a clock may have said so; 1: blocks, together
+    if decided > 1:
         print(f"  flags     {as_flags(trainer.config)}")
         print(f"  time      {run.spent:.1f} s from the first step to the last")
     if (dropped := run.dropped)["prunings"]:

@@ -1,9 +1,14 @@
 """Event files for TensorBoard, written by the package tensorboardX, which needs neither TensorFlow nor TensorBoard."""
 
+import sys
+import time
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
-from warp_splat.errors import imported
+from tqdm import tqdm
+
+from warp_splat.errors import imported, reason_of
 
 
 class EventLog:
@@ -15,26 +20,33 @@ class EventLog:
     """
 
     def __init__(self, folder: Path | None = None, begun: int = 0):
-        self.writer = writer_class()(str(folder), purge_step=begun + 1, flush_secs=10) if folder else None
+        self.file = None
+        if folder:
+            self.library = tensorboard_library()
+            self.file = self.library.event_file_writer.EventsWriter(str(folder / "events"))
+            session = self.library.proto.event_pb2.SessionLog
+            self._add(begun + 1, session_log=session(status=session.START))
 
     def write(self, points: Iterable[tuple[int, str, float]]) -> None:
-        """Points of curves: iteration, name of the curve, value."""
-        if self.writer:
-            for iteration, name, value in points:
-                self.writer.add_scalar(name, value, iteration)
-            self.writer.flush()
+        """Points of curves: iteration, name of the curve, value. They end with a warning where the disk is full."""
+        try:
+            for iteration, name, value in points if self.file else ():
+                self._add(iteration, summary=self.library.summary.scalar(name, value))
+            if self.file:
+                self.file.flush()
+        except OSError as error:
+            tqdm.write(f"warning: --tensorboard: no more curves are written ({reason_of(error)}).", file=sys.stderr)
+            self.file = None
 
-    def close(self) -> None:
-        """Nothing follows."""
-        if self.writer:
-            self.writer.close()
+    def _add(self, step: int, **what) -> None:
+        self.file.write_event(self.library.proto.event_pb2.Event(wall_time=time.time(), step=step, **what))
 
 
-def writer_class() -> type:
-    """What writes event files, tensorboardX's ``SummaryWriter``.
+def tensorboard_library() -> Any:
+    """tensorboardX, whose ``SummaryWriter`` has a thread that dies where the disk is full, and is waited for.
 
     Raises:
         InputError: if tensorboardX is not installed.
     """
     problem = "--tensorboard: expected the package tensorboardX; `pip install tensorboardX`."
-    return imported("tensorboardX", problem).SummaryWriter
+    return imported("tensorboardX", problem)
