@@ -127,7 +127,8 @@ class Optimizer:
         for name in self.parts:
             rate = self.tables[name].part_rate
             rates[name] = rate(iteration) if callable(rate) else rate
-        late = power(0.1, max(iteration - options.falls_from, 0), max(int(min(options.cooldown, options.end)), 1))
+        begin = max(options.end - options.cooldown, 0)
+        late = power(0.1, max(iteration - begin, 0), max(int(min(options.cooldown, options.end)), 1))
         for name, rate in rates.items():
             self.tables[name].rate = rate * self.scale * late
 

@@ -85,13 +85,6 @@ class LearnOptions:
     seed: int = learning(0, "seed of everything random", most=2**63 - 1)
 
     @property
-    def falls_from(self) -> float:
-        """The step of the cooldown's start; infinite as long as a clock has to say it."""
-        if self.settle_from_iter:
-            return self.settle_from_iter
-        return math.inf if self.minutes else max(self.iterations - self.cooldown, 0)
-
-    @property
     def end(self) -> float:
         """The last step; infinite as long as a clock has to say it."""
         if self.settle_from_iter:
