@@ -59,7 +59,7 @@ class Processes:
 
     def average(self, tensors: Sequence[torch.Tensor]) -> None:
         """Replace the tensors, sums over this process's images, by their means over all images of the step."""
-        if self.count == 1:
+        if self.count == 1 or self.sharded:  # of own Gaussians, it has the sums over all images
             for tensor in tensors if self.images > 1 else ():
                 tensor.div_(self.images)
             return

@@ -52,11 +52,6 @@ class Shards(Processes):
         """Of own Gaussians, what all saw."""
         return rows.amax(0) if largest else rows.sum(0)
 
-    def average(self, tensors: Sequence[torch.Tensor]) -> None:
-        """Of own Gaussians, a process has the sums over all images."""
-        for tensor in tensors:
-            tensor.div_(self.images)
-
     def lowest(self, values: torch.Tensor, count: int) -> torch.Tensor:
         """As of the whole."""
         (start,), _ = self._starts([len(values)])
