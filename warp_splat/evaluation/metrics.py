@@ -11,7 +11,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from warp_splat.errors import InputError
-from warp_splat.formats.files import read_json, write_json
+from warp_splat.formats.files import read_optional_json, write_json
 from warp_splat.formats.png import check_image
 
 # Wang et al. 2004, section III.C: an 11-tap Gaussian window of sigma 1.5, C1 = (0.01 L)^2, C2 = (0.03 L)^2, here L = 1.
@@ -124,7 +124,7 @@ def write_results(
 
 def _read_object(path: Path) -> dict:
     expected = "a JSON object with entries ours_N (otherwise move it away and run again)"
-    return read_json(path, expected, lambda found: {k: {**v} for k, v in found.items()}) if path.exists() else {}
+    return read_optional_json(path, expected, lambda found: {k: {**v} for k, v in found.items()}) or {}
 
 
 def _blur(image: np.ndarray) -> np.ndarray:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from warp_splat.formats.files import Unexpected, read_json, write_json
+from warp_splat.formats.files import Unexpected, read_optional_json, write_json
 
 FILE = "coordinates.json"
 KEPT = ("origin", "axes", "reference")  # of it, in files of Gaussians
@@ -26,8 +26,7 @@ def read_coordinates(folder: str | Path) -> dict | None:
     Raises:
         InputError: if it has no origin of three finite numbers.
     """
-    path = Path(folder) / FILE
-    return read_json(path, "coordinates as `warp-splat sfm` writes them", checked) if path.exists() else None
+    return read_optional_json(Path(folder) / FILE, "coordinates as `warp-splat sfm` writes them", checked)
 
 
 def write_coordinates(folder: str | Path, coordinates: dict | None) -> None:

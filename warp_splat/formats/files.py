@@ -188,6 +188,11 @@ def read_json(path: Path, expected: str, parse: Callable[[Any], T]) -> T:
             raise Unexpected(f"other JSON ({error!s:.100})") from error
 
 
+def read_optional_json(path: Path, expected: str, parse: Callable[[Any], T]) -> T | None:
+    """:func:`read_json` of a file that there may be; None without it."""
+    return read_json(path, expected, parse) if path.exists() else None
+
+
 def check_expansion(count: int, bytes_each: int, file_bytes: int) -> None:
     """Refuse a compressed file that says it holds more than real ones expand to, before anything is allocated.
 

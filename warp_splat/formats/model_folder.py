@@ -20,7 +20,7 @@ from warp_splat.camera import Camera
 from warp_splat.config import PROJECTIONS
 from warp_splat.errors import InputError, refusing
 from warp_splat.formats.exchange import FORMATS, load_gaussians
-from warp_splat.formats.files import T, Unexpected, read_json, write_text
+from warp_splat.formats.files import T, Unexpected, read_optional_json, write_text
 from warp_splat.formats.splats import SplatFile, cropped
 from warp_splat.lenses import Lens
 from warp_splat.lenses.shutter import Shutter
@@ -260,8 +260,7 @@ def read_cameras(folder: str | Path) -> list[tuple[str, Camera]]:
         except InputError as error:
             raise Unexpected(f"a camera with other values ({error!s:.200})") from error
 
-    path = Path(folder) / CAMERAS
-    return read_json(path, "a list of cameras as training writes it", parse) if path.exists() else []
+    return read_optional_json(Path(folder) / CAMERAS, "a list of cameras as training writes it", parse) or []
 
 
 def trained_names(path: str | Path) -> set[str]:
@@ -271,8 +270,7 @@ def trained_names(path: str | Path) -> set[str]:
         InputError: if the file is damaged.
     """
     names = lambda entries: {str(entry["img_name"]) for entry in entries if entry.get("trained")}  # noqa: E731
-    file = folder_of(path) / CAMERAS
-    return read_json(file, "a list of cameras as training writes it", names) if file.exists() else set()
+    return read_optional_json(folder_of(path) / CAMERAS, "a list of cameras as training writes it", names) or set()
 
 
 def read_refined(path: str | Path, iteration: int) -> dict[str, Camera]:
@@ -327,8 +325,7 @@ def read_beside(path: str | Path, iteration: int, name: str, expected: str, pars
     Raises:
         InputError: if the file is damaged, or another than ``expected``.
     """
-    beside = gaussians_file(path, iteration).parent / name
-    return read_json(beside, expected, parse) if beside.exists() else None
+    return read_optional_json(gaussians_file(path, iteration).parent / name, expected, parse)
 
 
 def _camera(entry: dict) -> Camera:
