@@ -51,9 +51,7 @@ class Block(NamedTuple):
 
     def starts(self, cameras: Sequence[Camera], points: np.ndarray) -> np.ndarray:
         """Which of ``points`` [P] it starts from: its own, and at most as many others that the cameras show."""
-        own, seen = self.holds(points), np.zeros(len(points), bool)
-        for camera in cameras:
-            seen |= visible(camera, points)
+        own, seen = self.holds(points), sum(visible(camera, points) for camera in cameras) > 0
         others = np.flatnonzero(seen & ~own)
         return np.sort(np.append(np.flatnonzero(own), others[:: -(-len(others) // max(1, own.sum())) or 1]))
 
