@@ -14,7 +14,7 @@ from warp_splat.lenses import Lens
 from warp_splat.lenses.shutter import Shutter, rotated
 from warp_splat.raster.camera_parameters import CameraParameters
 from warp_splat.raster.drivers import driver_of
-from warp_splat.runtime.launch import launch_in_lanes, load, send, view
+from warp_splat.runtime.launch import launch_in_lanes, send, view
 from warp_splat.runtime.sums import in_pairs
 from warp_splat.runtime.timers import stage
 
@@ -40,12 +40,6 @@ def put_behind(
         alpha = alpha.masked_fill(blind, 1.0)
     with stage("environment"):
         return _PutBehind.apply(image, alpha, harmonics, pose.rotation, rays)
-
-
-def load_kernels(device: torch.device) -> None:
-    """Compile and load them, for many pixels at once and for those left over."""
-    for lanes in {driver_of(device).lanes, 1}:
-        load(device, make_put_behind(lanes), make_adj_put_behind(lanes))
 
 
 @functools.lru_cache(maxsize=KEPT)

@@ -25,7 +25,7 @@ from warp_splat.kernels.structs import BinsView
 from warp_splat.kernels.tiles import count_in_front
 from warp_splat.raster import bin
 from warp_splat.raster.data import Bins, Pixels, Saved, alphas_of, limits_of, variant_of
-from warp_splat.runtime.launch import check_memory, empty, launch, launch_blocks, pack_struct, view
+from warp_splat.runtime.launch import check_memory, empty, launch, launch_blocks, load, pack_struct, view
 
 THREADS = TILE * TILE
 
@@ -232,3 +232,8 @@ DRIVERS = {"cpu": CPU, "cuda": CUDA}
 def driver_of(device: torch.device) -> Driver:
     """The driver of ``device``."""
     return DRIVERS[device.type]
+
+
+def load_in_lanes(device: torch.device, *makes: Callable[[int], wp.Kernel]) -> None:
+    """Compile and load what :func:`.launch_in_lanes` launches, for many rows at once and for those left over."""
+    load(device, *(make(lanes) for make in makes for lanes in {driver_of(device).lanes, 1}))

@@ -6,7 +6,7 @@ from torch.nn import functional
 
 from warp_splat.kernels.color_map import make_adj_map_colors, make_map_colors, vec12
 from warp_splat.raster.drivers import driver_of
-from warp_splat.runtime.launch import launch_in_lanes, load, view
+from warp_splat.runtime.launch import launch_in_lanes, view
 from warp_splat.runtime.sums import in_pairs
 from warp_splat.runtime.timers import stage
 
@@ -43,12 +43,6 @@ def color_matrix(kind: str, numbers: torch.Tensor, pivot: float) -> torch.Tensor
     n = [numbers if i % 4 == 0 else none for i in range(12)] if kind == "gain" else list(numbers.split(1))
     diagonal = [1.0 + n[i] if i % 4 == 0 else n[i] for i in range(9)]
     return torch.cat(diagonal + [n[9 + k] + pivot * ((n[k] + n[3 + k]) + n[6 + k]) for k in range(3)])
-
-
-def load_color_maps(device: torch.device) -> None:
-    """Compile and load them, for many pixels at once and for those left over."""
-    for lanes in {driver_of(device).lanes, 1}:
-        load(device, make_map_colors(lanes), make_adj_map_colors(lanes))
 
 
 def _through_grid(image: torch.Tensor, numbers: torch.Tensor, pivot: float) -> torch.Tensor:

@@ -12,8 +12,8 @@ from warp_splat.formats.checkpoint import Checkpoint
 from warp_splat.gaussians import CHUNK, activate
 from warp_splat.kernels.statistics import make_observe
 from warp_splat.raster.api import RenderOutput
-from warp_splat.raster.drivers import driver_of
-from warp_splat.runtime.launch import launch_in_lanes, load
+from warp_splat.raster.drivers import driver_of, load_in_lanes
+from warp_splat.runtime.launch import launch_in_lanes
 from warp_splat.training.growth import ReferenceOptions
 from warp_splat.training.optimizer import Optimizer
 from warp_splat.training.seams import Change, Setting, Step
@@ -65,7 +65,7 @@ class Reference:
 
     def load(self) -> None:
         """Compile and load the kernel of :meth:`observe`."""
-        load(self.model.device, *map(make_observe, {driver_of(self.model.device).lanes, 1}))
+        load_in_lanes(self.model.device, make_observe)
 
     def update(self, iteration: int) -> Change | None:
         """Densify, prune and reset opacities if it is time; None if the set did not change."""

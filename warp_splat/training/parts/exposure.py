@@ -13,8 +13,10 @@ import torch
 from warp_splat.color import COLOR_MAPS, PIVOT
 from warp_splat.errors import InputError
 from warp_splat.formats.exposures import Exposures
+from warp_splat.kernels.color_map import make_adj_map_colors, make_map_colors
 from warp_splat.raster.api import RenderOutput
-from warp_splat.raster.expose import color_matrix, expose, load_color_maps
+from warp_splat.raster.drivers import load_in_lanes
+from warp_splat.raster.expose import color_matrix, expose
 from warp_splat.runtime.sums import in_pairs
 from warp_splat.runtime.timers import stage
 from warp_splat.scene.gains import GREEN, NEEDED, gains_of
@@ -69,7 +71,7 @@ class Exposure:
     def load(self) -> None:
         """Compile and load the kernels."""
         if self.kind != "bilateral":
-            load_color_maps(self.maps.device)
+            load_in_lanes(self.maps.device, make_map_colors, make_adj_map_colors)
 
     def image(self, image: torch.Tensor, out: RenderOutput, step: Step) -> torch.Tensor:
         """As the camera of this view would have shown it."""

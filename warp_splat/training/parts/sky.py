@@ -6,8 +6,8 @@ Without it Gaussians have to be where the sky is: huge ones, far away, or streak
 import torch
 
 from warp_splat.errors import InputError
-from warp_splat.kernels.environment import COEFFICIENTS
-from warp_splat.raster.behind import load_kernels
+from warp_splat.kernels.environment import COEFFICIENTS, make_adj_put_behind, make_put_behind
+from warp_splat.raster.drivers import load_in_lanes
 from warp_splat.scene.horizon import NEEDED, share_of_sky
 from warp_splat.scene.types import Scene
 from warp_splat.training.optimizer import power
@@ -52,7 +52,7 @@ class Sky:
 
     def load(self) -> None:
         """Compile and load the kernels."""
-        load_kernels(self.harmonics.device)
+        load_in_lanes(self.harmonics.device, make_put_behind, make_adj_put_behind)
 
     def background(self, color: torch.Tensor, step: Step) -> torch.Tensor:
         """The sky instead of a color."""
