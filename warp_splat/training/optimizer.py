@@ -124,13 +124,11 @@ class Optimizer:
             "scales": options.scaling_lr,
             "quats": options.rotation_lr,
         }
-        for name in self.parts:
-            rate = self.tables[name].part_rate
-            rates[name] = rate(iteration) if callable(rate) else rate
         begin = max(options.end - options.cooldown, 0)
         late = power(0.1, max(iteration - begin, 0), max(int(min(options.cooldown, options.end)), 1))
-        for name, rate in rates.items():
-            self.tables[name].rate = rate * self.scale * late
+        for name, table in self.tables.items():
+            rate = rates.get(name, table.part_rate)
+            table.rate = (rate(iteration) if callable(rate) else rate) * self.scale * late
 
     def step(self, radii: torch.Tensor | None) -> None:
         """Update from the gradients and clear them.
