@@ -9,13 +9,13 @@ from typing import Literal, NamedTuple
 import numpy as np
 from PIL import Image
 
-from warp_splat.color import to_srgb
 from warp_splat.errors import InputError
 from warp_splat.scene import TRAIN, colmap, images, takes_colmap, transforms, with_masks
 from warp_splat.scene.colmap_library import pycolmap
 from warp_splat.scene.images import Photo
 from warp_splat.scene.lenses import make_sampling
 from warp_splat.scene.photos import ImageFinder
+from warp_splat.scene.types import as_shown
 from warp_splat.text import few
 
 THUMBNAIL = 240  # px, the longer side
@@ -138,8 +138,7 @@ def _decode(subject: Subject) -> Iterator[Finding]:
         lists = [subject.alpha] * (alpha is not None) + [subject.linear] * linear
         if photo.mask and not images.read_mask(photo.mask, (image.shape[1], image.shape[0]), False).any():
             lists.append(subject.black)
-        image = to_srgb(image.clip(0), np.where) if linear else image
-        small = Image.fromarray(np.rint(255 * image.clip(0, 1)).astype(np.uint8))
+        small = Image.fromarray(as_shown(image) if linear else np.rint(255 * image.clip(0, 1)).astype(np.uint8))
         small.thumbnail((THUMBNAIL, THUMBNAIL))
         return np.array(small), lists
 
