@@ -25,6 +25,7 @@ from warp_splat.runtime.interrupts import interruptible
 from warp_splat.runtime.shards import Shards
 from warp_splat.scene.blocks import BLOCK, holds_another, merge_blocks
 from warp_splat.scene.start import load_start
+from warp_splat.text import Report
 from warp_splat.training import memory, opening
 from warp_splat.training.deadline import plan_training
 from warp_splat.training.loop import train_steps
@@ -120,7 +121,7 @@ def _train(config: TrainConfig, processes: Processes) -> int:
             return _run(trainer, run, viewer) or _finish(trainer, run, viewer, say)
 
 
-def _tell(trainer: Trainer, run: Run, say: opening.Say) -> None:
+def _tell(trainer: Trainer, run: Run, say: Report) -> None:
     scene, processes = trainer.scene, trainer.processes
     together = f"{processes.count} processes with " * (processes.count > 1)
     width, height = scene.train[0].camera.width, scene.train[0].camera.height
@@ -135,7 +136,7 @@ def _tell(trainer: Trainer, run: Run, say: opening.Say) -> None:
         say(sentence)
 
 
-def _restore_or_begin(trainer: Trainer, run: Run, begun: Checkpoint | None, say: opening.Say) -> None:
+def _restore_or_begin(trainer: Trainer, run: Run, begun: Checkpoint | None, say: Report) -> None:
     leads, config = trainer.processes.rank == 0, trainer.config
     if leads:
         opening.refuse_other_training(run.folder, begun)  # again: one may have ended meanwhile
@@ -182,7 +183,7 @@ def _run(trainer: Trainer, run: Run, viewer: TrainingViewer | None) -> int:
     return 0
 
 
-def _finish(trainer: Trainer, run: Run, viewer: TrainingViewer | None, say: opening.Say) -> int:
+def _finish(trainer: Trainer, run: Run, viewer: TrainingViewer | None, say: Report) -> int:
     """Evaluate and tell; returns the process's exit code."""
     end, watched = trainer.config.learn.end, trainer.config.report.viewer
     if watched:

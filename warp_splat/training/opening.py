@@ -1,7 +1,6 @@
 """Before the first step: options become what holds on this machine, the folder is chosen, the scene is read."""
 
 import os
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -23,15 +22,15 @@ from warp_splat.scene.decoding import photo_memory
 from warp_splat.scene.embedded import embedded_scene
 from warp_splat.scene.photos import scene_of
 from warp_splat.scene.types import Scene
+from warp_splat.text import Report
 from warp_splat.training.config_file import load_options, write_config
 from warp_splat.training.options import FIXED_OPTIONS, TrainConfig
 from warp_splat.training.tensorboard import tensorboard_library
 
-Say = Callable[[str], None]
 OF_SCENE = ("images", "resolution", "white_background", "eval", "invert_masks", "lens", "block")  # load_scene's options
 
 
-def speaker(quiet: bool) -> Say:
+def speaker(quiet: bool) -> Report:
     """What prints a line above the progress bar, or nothing."""
     return (lambda *_: None) if quiet else tqdm.write
 
@@ -120,7 +119,7 @@ def refuse_other_training(folder: Path, begun: Checkpoint | None) -> None:
         raise InputError(f"{folder}: it already holds a training; choose another with -m, or --resume {folder}.")
 
 
-def open_scene(config: TrainConfig, begun: Checkpoint | None, say: Say, processes: int = 1) -> Scene:
+def open_scene(config: TrainConfig, begun: Checkpoint | None, say: Report, processes: int = 1) -> Scene:
     """Read the scene and tell what may surprise."""
     data = config.data
     say(f"Scene {data.source_path}")
