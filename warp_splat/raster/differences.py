@@ -166,7 +166,6 @@ def _growth(scene: MovableScene, name: str, step: torch.Tensor) -> torch.Tensor:
     return (torch.stack([1 + dyy / yy, 1 + dxx / xx], 1) / det[:, None]).clamp_min(1e-3).sqrt()
 
 
-@torch.no_grad()
 def _natural(scene: MovableScene, name: str) -> torch.Tensor | float:
     """The size of a large step of each value, broadcasts to the parameter's shape."""
     value = scene.tensor(name)
