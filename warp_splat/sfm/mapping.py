@@ -177,8 +177,7 @@ def _map_stepwise(database: Path, root: Path, config: SfmConfig, part: Path, sta
     if start:
         options.multiple_models = False
         options.fix_existing_frames = True  # they are adjusted; again, thousands take longer than all before
-        for name, value in RELAXED.items():
-            setattr(options.mapper, name, value)
+        options.mapper.mergedict(RELAXED)
     registered = [1] * (pycolmap.Reconstruction(str(start)).num_reg_images() if start else 0)
     found = {
         "initial_image_pair_callback": lambda: registered.extend((1, 1)),
