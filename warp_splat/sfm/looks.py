@@ -4,7 +4,7 @@ A photograph is described by its own SIFT features in a vocabulary of the captur
 normalized residuals (Arandjelovic and Zisserman 2013). All is drawn from a seed, and ties go to the lower number.
 """
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable
 from itertools import combinations, pairwise
 
@@ -96,10 +96,9 @@ def beyond(matched: dict[tuple[int, int], int], tried: set[tuple[int, int]]) -> 
         for (a, to_a), (b, to_b) in combinations(sorted(fits[middle].items()), 2):
             if (a, b) not in tried:
                 score[a, b] += min(to_a, to_b)
-    taken, room = [], dict.fromkeys(fits, NEAREST)
+    taken, partners = [], Counter()
     for pair in sorted(score, key=lambda pair: (-score[pair], pair)):
-        if score[pair] >= THROUGH and all(room[each] > 0 for each in pair):
+        if score[pair] >= THROUGH and all(partners[each] < NEAREST for each in pair):
             taken.append(pair)
-            for each in pair:
-                room[each] -= 1
+            partners.update(pair)
     return sorted(taken)
