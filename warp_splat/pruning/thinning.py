@@ -82,10 +82,8 @@ def fewer_harmonics(splats: SplatArrays, setting: ViewSetting, squared_error: fl
     bounds = np.unique(np.append(change, 0.0))  # up to one of them a Gaussian's change is accepted
     larger = bisect_right(bounds, allowed, key=lambda bound: _degrees(change, bound)[1])  # the first for which too much
     degrees, _ = _degrees(change, bounds[larger - 1])
-    sh = splats.sh.copy()
-    for degree in range(change.shape[1]):
-        sh[degrees == degree, COEFFICIENTS[degree] :] = 0.0
-    return splats._replace(sh=sh)
+    kept = np.arange(splats.sh.shape[1]) < np.array(COEFFICIENTS)[degrees, None]
+    return splats._replace(sh=np.where(kept[..., None], splats.sh, np.float32(0)))
 
 
 def _degrees(change: np.ndarray, bound: float) -> tuple[np.ndarray, float]:
