@@ -20,7 +20,7 @@ from warp_splat.config import RasterOptions
 from warp_splat.errors import InputError
 from warp_splat.raster.api import render
 from warp_splat.runtime import timers
-from warp_splat.text import table_of
+from warp_splat.text import Report, table_of
 
 ON_CPU = ("generated", "plain")  # variants without kernels for a GPU
 REPEATS = 5
@@ -78,7 +78,7 @@ def variants_of(modes: Sequence[str], device: torch.device) -> list[Variant]:
     return found + [Variant(f"cap {cap}", "manual", {"max_steps": cap}) for cap in CAPS]
 
 
-def run_adjoints(workloads: Sequence[Workload], modes: Sequence[str], say: Callable[[str], None]) -> list[Measurement]:
+def run_adjoints(workloads: Sequence[Workload], modes: Sequence[str], say: Report) -> list[Measurement]:
     """Every variant on every workload, and central differences."""
     results = []
     if any(workload.device.type != "cpu" for workload in workloads):

@@ -1,6 +1,5 @@
 """``warp-splat compare``: which comparison to run, and where its results go."""
 
-from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 
@@ -18,6 +17,7 @@ from warp_splat.formats.model_folder import prepare_folder
 from warp_splat.raster.gradcheck import check_gradients
 from warp_splat.raster.selftest import settle_device
 from warp_splat.runtime import pool
+from warp_splat.text import Report
 
 DIRECTIONS = 4  # per parameter
 
@@ -58,7 +58,7 @@ def run(config: CompareConfig) -> int:
     return code
 
 
-def _compare_modes(workloads: list[Workload], modes: list[str], out: Path, say: Callable[[str], None]) -> None:
+def _compare_modes(workloads: list[Workload], modes: list[str], out: Path, say: Report) -> None:
     """Adjoints on every workload; for the scenes in training, the whole image's gradients by finite differences."""
     print("Kernels of every variant are compiled once on a machine, about a minute in all.")  # not a result
     measured, checks = adjoints.run_adjoints(workloads, modes, say), {}

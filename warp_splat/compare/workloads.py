@@ -1,6 +1,5 @@
 """What adjoints and knobs are measured on: layered scenes of known depth complexity, and scenes in training."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ from warp_splat.raster.data import Gaussians
 from warp_splat.scene import load_scene
 from warp_splat.scene.embedded import embedded_scene
 from warp_splat.scene.types import Scene
+from warp_splat.text import Report
 from warp_splat.training.options import TrainConfig
 from warp_splat.training.trainer import Trainer
 
@@ -76,7 +76,7 @@ def layered(candidates: int) -> Workload:
     return Workload(f"{candidates} layers", gaussians, camera, background, RasterOptions(), sample_pixels(camera))
 
 
-def in_training(name: str, scene: Scene, device: torch.device, say: Callable[[str], None]) -> list[Workload]:
+def in_training(name: str, scene: Scene, device: torch.device, say: Report) -> list[Workload]:
     """The first held-out view of a scene after each of :data:`STAGES` of the short schedule."""
     trainer = Trainer(scene, TrainConfig(**SHORT, device=device.type))
     camera = scene.evaluated[1][0].camera
@@ -93,7 +93,7 @@ def in_training(name: str, scene: Scene, device: torch.device, say: Callable[[st
     return found
 
 
-def named_scenes(scene: str, say: Callable[[str], None]) -> dict[str, Scene]:
+def named_scenes(scene: str, say: Report) -> dict[str, Scene]:
     """The embedded scene, and the one in the folder ``scene`` if that is not empty, by names that differ.
 
     Raises:

@@ -4,7 +4,6 @@ import hashlib
 import shlex
 import sys
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -25,7 +24,7 @@ from warp_splat.runtime.devices import peak_memory
 from warp_splat.runtime.distributed import Processes
 from warp_splat.scene.blocks import write_block
 from warp_splat.scene.types import View
-from warp_splat.text import format_table
+from warp_splat.text import Report, format_table
 from warp_splat.training.config_file import OF_ONE_RUN, write_config
 from warp_splat.training.plan import as_flags
 from warp_splat.training.seams import having
@@ -166,7 +165,7 @@ def how_to_continue(folder: Path, processes: Processes) -> str:
     return shlex.join([*program, "--resume", str(folder)])
 
 
-def finish(trainer: Trainer, run: Run, say: Callable[[str], None]) -> None:
+def finish(trainer: Trainer, run: Run, say: Report) -> None:
     """Pictures, curves and numbers of the saved model, and where they lie."""
     assert run.saved
     wall = time.perf_counter() - run.start

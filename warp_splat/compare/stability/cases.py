@@ -6,14 +6,14 @@ table, and the tests run the same catalog. The bounds are those of Higham, Accur
 Algorithms, 2002: n eps for a product of n rounded factors, and the condition of a problem where that is larger.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 from warp_splat.compare.stability import arithmetic, pixel_loop, shapes
 from warp_splat.compare.stability.verdict import EPS, Case, Outcome
 from warp_splat.formats.files import write_csv, write_json
-from warp_splat.text import format_table
+from warp_splat.text import Report, format_table
 
 CASES = (*pixel_loop.CASES, *shapes.CASES, *arithmetic.CASES)
 NO_MODE = ""  # of a case that involves no adjoint
@@ -33,7 +33,7 @@ class Row(NamedTuple):
         return "FAIL" if len(failed) == len(self.outcomes) else f"FAIL {', '.join(failed)}"
 
 
-def run_cases(out: Path, modes: Sequence[str], say: Callable[[str], None] = print) -> int:
+def run_cases(out: Path, modes: Sequence[str], say: Report = print) -> int:
     """Measure every case in every mode; print the table and write it.
 
     Args:
