@@ -10,6 +10,7 @@ from fake_viser import some_scene
 from pages import CAMERAS, EVIL, OPTIONS, Blocks, many_splats, unpacked
 from splat_files import covariances, some_splats
 
+from warp_splat.camera import Camera
 from warp_splat.cli import main
 from warp_splat.evaluation.metrics import psnr
 from warp_splat.export_html import pack
@@ -20,6 +21,7 @@ from warp_splat.formats.exchange import save_gaussians
 from warp_splat.formats.model_folder import ply_path, write_cameras
 from warp_splat.formats.splats import SplatArrays, SplatFile
 from warp_splat.gaussians import GaussianModel
+from warp_splat.lenses import Lens
 from warp_splat.rendering.camera_paths import ORBIT_LENS, orbit_cameras
 
 PARTS = ["gaussians0", "gaussians1", "gaussians2", "gaussians3", "harmonics1", "harmonics2", "harmonics3"]
@@ -177,12 +179,21 @@ def test_cameras_say_what_is_important(small_chunks):
     """What they see comes first; of that, what is near."""
     splats = some_splats(3000)
     splats.scales[:], splats.opacities[:] = -3.0, 0.0
-    order = importance(splats, [CAMERAS[0][1]])
-    depths = splats.means.astype(float) @ CAMERAS[0][1].rotation[2] + CAMERAS[0][1].translation[2]
+    (_, camera), *_ = CAMERAS
+    order = importance(splats, [camera])
+    away = np.linalg.norm(splats.means - camera.center, axis=1)
     seen = order > 0
     assert 100 < seen.sum() < 2900
-    np.testing.assert_array_equal(np.argsort(-order[seen]), np.argsort(depths[seen]))
-    assert (depths[seen] > 0).all()
+    np.testing.assert_array_equal(np.argsort(-order[seen]), np.argsort(away[seen]))
+    assert (splats.means.astype(float) @ camera.rotation[2] + camera.translation[2])[seen].min() > 0
+
+
+def test_a_panorama_sees_all_around(small_chunks):
+    splats = some_splats(3000)
+    splats.scales[:], splats.opacities[:] = -3.0, 0.0
+    splats.means[:] *= 2 / np.linalg.norm(splats.means, axis=1, keepdims=True)
+    camera = Camera(40, 20, 20 / np.pi, 20 / np.pi, 20, 10, np.eye(3), np.zeros(3), lens=Lens("EQUIRECTANGULAR", ()))
+    np.testing.assert_allclose(importance(splats, [camera]), importance(splats, [camera])[0], rtol=1e-5)
 
 
 @pytest.mark.slow

@@ -14,11 +14,11 @@ from warp_splat.camera import Camera
 from warp_splat.config import FRUSTUM_MARGIN, NEAR
 from warp_splat.formats.splats import SplatArrays, sizes
 from warp_splat.formats.stored import LOG_SCALES, logit, sigmoid, unit_quats
+from warp_splat.scene.types import visible
 
 POWER = 0.4  # of a Gaussian's importance: its weight where sets are cut in halves; measured: 0.25 and 0.5 are alike
 ALONE = 10  # one group of so many is a single one of the largest, which would swallow its neighbors: up to 0.9 dB
 MOST_CAMERAS = 16  # that are asked what is important
-REACH = 0.5 * (1 + FRUSTUM_MARGIN)  # of an image, from its middle: what is just outside reaches into it
 FLATTEST = 1e-37  # least variance, world units squared
 
 
@@ -46,11 +46,9 @@ def importance(splats: SplatArrays, cameras: Sequence[Camera]) -> np.ndarray:
     """
     total = np.zeros(len(splats.means))
     for camera in cameras[:: -(-len(cameras) // MOST_CAMERAS) or 1]:
-        x, y, z = camera.rotation @ splats.means.T + camera.translation[:, None]
-        z = np.maximum(z, NEAR)
-        across, down = (camera.fx * x / z + camera.cx) / camera.width, (camera.fy * y / z + camera.cy) / camera.height
-        inside = (z > NEAR) & (np.abs(across - 0.5) < REACH) & (np.abs(down - 0.5) < REACH)
-        total += np.where(inside, camera.fx * camera.fy / z**2, 0.0)
+        away = np.maximum(np.linalg.norm(splats.means - camera.center, axis=1), NEAR)
+        inside = visible(camera, splats.means, 0.5 * FRUSTUM_MARGIN)  # what is just outside reaches into it
+        total += np.where(inside, camera.fx * camera.fy / away**2, 0.0)
     return sizes(splats) * (total if cameras else 1.0)
 
 

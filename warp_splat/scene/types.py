@@ -26,15 +26,20 @@ REFINED = 0.05  # of a scene's extent, and rad, together, by which a training mo
 EVALUATED = 100  # views, at most, of those for training: hundreds more would take hours, and say the same
 
 
-def visible(camera: Camera, points: np.ndarray) -> np.ndarray:
-    """Which of ``points`` [P, 3] show inside the camera's image, [P] bool: of a pinhole, those in front of it."""
+def visible(camera: Camera, points: np.ndarray, margin: float = 0.0) -> np.ndarray:
+    """Which of ``points`` [P, 3] show inside the camera's image, [P] bool: of a pinhole, those in front of it.
+
+    ``margin``: of its size, what counts as well at each side.
+    """
     x, y, z = (camera.rotation[:, :, None] * points.T).sum(1) + camera.translation[:, None]
     if camera.lens:
         px, py = camera.pixels(np.stack([x, y, z], 1)).T  # NaN, and so outside, where the lens sees nothing
-        return (px >= 0) & (px <= camera.width) & (py >= 0) & (py <= camera.height)
-    in_width = (x * camera.fx + z * camera.cx >= 0) & (x * camera.fx + z * camera.cx <= z * camera.width)
-    in_height = (y * camera.fy + z * camera.cy >= 0) & (y * camera.fy + z * camera.cy <= z * camera.height)
-    return (z > 0) & in_width & in_height
+        z = np.ones_like(px)
+    else:
+        px, py = x * camera.fx + z * camera.cx, y * camera.fy + z * camera.cy  # times z
+    across, down = margin * camera.width * z, margin * camera.height * z
+    in_width = (px >= -across) & (px <= z * camera.width + across)
+    return (z > 0) & in_width & (py >= -down) & (py <= z * camera.height + down)
 
 
 def nearest_shown(cameras: list[Camera], points: np.ndarray, least: float = 0.0) -> float:
