@@ -16,7 +16,7 @@ from warp_splat.formats.files import write_csv
 from warp_splat.formats.model_folder import folder_of, is_file_of_gaussians, read_cfg_args
 from warp_splat.formats.splats import COEFFICIENTS, SplatArrays, SplatFile, sizes
 from warp_splat.pruning.opened import Opened, output_of, require_some, write, written_bytes
-from warp_splat.pruning.thinning import Thinning, fewer_harmonics, model_of, tuned
+from warp_splat.pruning.thinning import HARMONICS_LOSS, Thinning, fewer_harmonics, model_of, tuned
 from warp_splat.rendering.changes import largest_change
 from warp_splat.rendering.finished import Finished
 from warp_splat.text import format_table, upward
@@ -60,7 +60,7 @@ def simplify(config: SimplifyConfig) -> int:
     if config.tolerance:
         _, count = _narrowed(0, total, lambda count: changed(made(count))[1] > config.tolerance)
     elif config.max_loss:
-        least = opened.psnr(file.splats, views) - config.max_loss
+        least = opened.psnr(file.splats, views) - max(config.max_loss - HARMONICS_LOSS, 0.0)
         _, count = _narrowed(0, total, lambda count: opened.psnr(made(count), views) < least)
     else:
         count = _count(config, output, file, thinning.to)
