@@ -23,8 +23,9 @@ COARSE = 0.1  # of the extent: GPS that errs by more is not taken
 USUAL = 5.0  # units: half of what photographs show is farther away, where nothing tells the scale
 TURNED = 0.7  # cosine: of where photographs have their top, or look, against up
 DOUBT = " (photographs stand upside down there, or look up: are x and y exchanged?)"  # flat positions fit turned over
-LINE = " (up from the photographs, as positions lie along a line)"
-UNSURE = 0.1  # radians: of a turn about the line along which positions lie, above which they do not tell up
+NO_UP = " (up from the photographs, as positions lie along a line)"
+LINE = 0.1  # share of the extent that positions leave a straight line by, below which they do not tell up,
+UNSURE = 0.1  # radians, if they err so much that a turn about the line is off by more
 NUDGE = 1e-7  # of their size: without it, pycolmap finds nothing for points on a line, or on a plane through 0
 
 
@@ -84,7 +85,7 @@ def georeference(model: pycolmap.Reconstruction, database: Path, source: str, se
     rest = f"; left out: {few(left_out)}" if left_out else ""
     rest += "; three always fit: give more" * int(right.sum() == LEAST)
     tops, ahead = np.stack([-axes[1], axes[2]]) @ fitted.rotation.matrix()[2]
-    reference += LINE * line
+    reference += NO_UP * line
     reference += DOUBT if tops < -TURNED or (tops < TURNED and ahead > TURNED) else ""
     say(f"coordinates: {reference}, {right.sum()} positions fit within {error:.2g} m (median){rest}")
     return _described(origin, reference, fitted.scale, dict(zip(names, residuals.tolist(), strict=True)), left_out)
@@ -129,7 +130,7 @@ def fit(
     middle = centers[right].mean(0)
     _, spans, (along, *_) = np.linalg.svd(centers[right] - middle)
     unsure = np.median(residuals[right]) + 10 * NUDGE * _extent(world[right])
-    if line := bool(unsure > UNSURE * fitted.scale * spans[1]):
+    if line := bool(spans[1] < min(LINE * spans[0], unsure / UNSURE / fitted.scale)):
         ends = [fitted.rotation * along, UP], [along, up]
         turned = pycolmap.Rotation3d(Rotation.align_vectors(*ends, weights=[np.inf, 1.0])[0].as_matrix())
         fitted = pycolmap.Sim3d(fitted.scale, turned, fitted * middle - fitted.scale * (turned * middle))
