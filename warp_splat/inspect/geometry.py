@@ -76,16 +76,12 @@ def check_coverage(subject: Subject) -> Iterator[Finding]:
     if not subject.photos or not len(subject.points):
         return
     points = sample(subject.points, POINTS)
-    counts = np.zeros(len(points), int)
-    scale = len(subject.points) / len(points)
-    for photo in subject.photos:
-        inside = visible(photo.camera, points)
-        counts += inside
-        subject.seen[photo.name] = round(scale * np.count_nonzero(inside))
-    poor = [name for name, seen in subject.seen.items() if seen < FEW_POINTS]
+    inside = np.array([visible(photo.camera, points) for photo in subject.photos])
+    counts, seen = inside.sum(0), np.rint(len(subject.points) / len(points) * inside.sum(1))
+    poor = [photo.name for photo, number in zip(subject.photos, seen, strict=True) if number < FEW_POINTS]
     text = f", each point inside {np.median(counts):.0f} of {len(subject.photos)}"
     text = f", but fewer than {FEW_POINTS} in {few(poor)}" if poor else text
-    median = f"{np.median(list(subject.seen.values())):.0f} points lie inside the median image"
+    median = f"{np.median(seen):.0f} points lie inside the median image"
     yield Finding("coverage", "warning" if poor else "ok", f"{median}{text}.")
     unseen = np.count_nonzero(counts == 0) / len(points)
     level = "error" if unseen == 1 else "warning" if unseen > UNSEEN and not subject.random_points else "ok"

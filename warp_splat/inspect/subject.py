@@ -46,7 +46,6 @@ class Subject:
     black: list[str] = field(default_factory=list)  # whose masks are black all over
     errors: dict[str, np.ndarray] = field(default_factory=dict)  # px, of each observation of an image
     pixels: dict[str, np.ndarray] = field(default_factory=dict)  # [n, 2] px in the model's image, of each observation
-    seen: dict[str, int] = field(default_factory=dict)  # points inside an image
     stops: dict[str, float] = field(default_factory=dict)  # gain of an image, their mean is 0
     exif: dict[str, float] = field(default_factory=dict)  # the same from EXIF, with the mean of those above
 
