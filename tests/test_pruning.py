@@ -153,13 +153,17 @@ def test_harmonics_that_do_not_show_become_zeros():
     splats.sh[20:25, 1:] *= 1e-4
     setting = setting_of(cameras)
     error = 30.0 * SIZE[0] * SIZE[1] * 3 * 0.01**2  # 40 dB
-    found = fewer_harmonics(splats, setting, error)
+    found = fewer_harmonics(splats, setting, error, lambda fewer: True)
     degrees = degrees_of(found)
     assert (degrees[:10] <= 2).all() and (degrees[10:20] <= 1).all() and (degrees[20:25] == 0).all()
     assert degrees[25:].max() == 3
     changed = len(cameras) * cost(splats, found, setting, cameras[0])
     assert 0 < changed < 1.5 * error * (10 ** (0.02 / 10) - 1)
     np.testing.assert_array_equal(found.sh[found.sh != 0], splats.sh[found.sh != 0])
+    seen = []
+    none = fewer_harmonics(splats, setting, error, lambda fewer: seen.append(degrees_of(fewer).sum()))  # not enough
+    np.testing.assert_array_equal(none.sh, splats.sh)
+    assert len(seen) > 1 and seen == sorted(seen) and seen[0] == degrees.sum()
 
 
 def test_floaters_hang_before_few_cameras():

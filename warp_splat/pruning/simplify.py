@@ -1,5 +1,6 @@
 """``warp-splat simplify``: a finished model in fewer Gaussians and harmonics, to a share, a loss or a size of file."""
 
+import math
 import os
 import re
 import time
@@ -51,6 +52,7 @@ def simplify(config: SimplifyConfig) -> int:
         return tuned(opened.scene, file, opened.setting, count, config.steps, opened.trained)
 
     total, views = len(file.splats.means), opened.scene.train
+    before = opened.psnr(file.splats, views) if config.max_loss else math.inf
 
     def changed(splats: SplatArrays) -> tuple[float, float]:
         before, after = (model_of(some, opened.setting).activated() for some in (file.splats, splats))
@@ -60,13 +62,16 @@ def simplify(config: SimplifyConfig) -> int:
     if config.tolerance:
         _, count = _narrowed(0, total, lambda count: changed(made(count))[1] > config.tolerance)
     elif config.max_loss:
-        least = opened.psnr(file.splats, views) - max(config.max_loss - HARMONICS_LOSS, 0.0)
-        _, count = _narrowed(0, total, lambda count: opened.psnr(made(count), views) < least)
+        enough = before - max(config.max_loss - HARMONICS_LOSS, 0.0)
+        _, count = _narrowed(0, total, lambda count: opened.psnr(made(count), views) < enough)
     else:
         count = _count(config, output, file, thinning.to)
     splats = made(count)
     if not config.tolerance:
-        splats = fewer_harmonics(splats, opened.setting, squared_error(opened, splats))
+        now, pixels = opened.psnr(splats, views), sum(view.camera.width * view.camera.height for view in views)
+        least = before - config.max_loss if config.max_loss else now - HARMONICS_LOSS
+        good = lambda fewer: opened.psnr(fewer, views) >= least  # noqa: E731
+        splats = fewer_harmonics(splats, opened.setting, 3 * pixels * 10 ** (-now / 10), good)
     if config.size and config.steps:  # trained numbers are harder to pack
         thinning = Thinning(splats, opened.setting)
         splats = thinning.to(_count(config, output, file._replace(splats=splats), thinning.to))
@@ -135,15 +140,6 @@ def _narrowed(low: int, high: int, is_low: Callable[[int], bool]) -> tuple[int, 
         middle = (low + high) // 2
         low, high = (middle, high) if is_low(middle) else (low, middle)
     return low, high
-
-
-def squared_error(opened: Opened, splats: SplatArrays) -> float:
-    """Of the training views, summed over pixels and channels, colors 0..1."""
-    picture, error = opened.picture_of(splats), 0.0
-    for view in opened.scene.train:
-        squared = (picture(view.camera, view.name) / 255.0 - view.picture / 255.0) ** 2
-        error += float(squared.sum() if view.mask is None else squared[view.mask > 0].sum())
-    return error
 
 
 def _curve(opened: Opened, thinning: Thinning, output: Path) -> None:

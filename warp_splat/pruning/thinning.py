@@ -2,6 +2,7 @@
 
 import math
 from bisect import bisect_right
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -68,22 +69,26 @@ def _costliest(model: GaussianModel, setting: ViewSetting, count: int) -> torch.
     return torch.sort(order[:count]).values
 
 
-def fewer_harmonics(splats: SplatArrays, setting: ViewSetting, squared_error: float) -> SplatArrays:
+def fewer_harmonics(splats: SplatArrays, setting: ViewSetting, error: float, good: Callable) -> SplatArrays:
     """The Gaussians with zeros for harmonics of degrees that do not show, each from its own degree on.
 
     Args:
         splats: the Gaussians.
         setting: the training views.
-        squared_error: of their images against the photographs, summed over pixels and channels, colors 0..1. It may
-            grow by HARMONICS_LOSS.
+        error: squared, of their images against the photographs, summed over pixels and channels, colors 0..1. It may
+            grow by HARMONICS_LOSS, as the change by each degree of each Gaussian alone tells.
+        good: tells of such Gaussians whether they are; if not, a quarter of that growth is tried.
     """
     change = costs(model_of(splats, setting), setting).harmonics.cpu().numpy()
-    allowed = squared_error * (10 ** (HARMONICS_LOSS / 10) - 1)
+    allowed = error * (10 ** (HARMONICS_LOSS / 10) - 1)
     bounds = np.unique(np.append(change, 0.0))  # up to one of them a Gaussian's change is accepted
-    larger = bisect_right(bounds, allowed, key=lambda bound: _degrees(change, bound)[1])  # the first for which too much
-    degrees, _ = _degrees(change, bounds[larger - 1])
-    kept = np.arange(splats.sh.shape[1]) < np.array(COEFFICIENTS)[degrees, None]
-    return splats._replace(sh=np.where(kept[..., None], splats.sh, np.float32(0)))
+    while True:
+        larger = bisect_right(bounds, allowed, key=lambda bound: _degrees(change, bound)[1])  # first for which too much
+        kept = np.array(COEFFICIENTS)[_degrees(change, bounds[larger - 1])[0], None] > np.arange(splats.sh.shape[1])
+        fewer = splats._replace(sh=np.where(kept[..., None], splats.sh, np.float32(0)))
+        if larger == 1 or good(fewer):
+            return fewer
+        allowed /= 4
 
 
 def _degrees(change: np.ndarray, bound: float) -> tuple[np.ndarray, float]:
