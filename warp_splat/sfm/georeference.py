@@ -17,13 +17,13 @@ from warp_splat.text import Report, few
 POSITIONS, DISTANCES = ["name", "x", "y", "z"], ["name", "other", "distance"]  # first lines of files
 LEAST = 3  # positions
 UP = np.array((0.0, 0.0, 1.0))  # in the world
-LOOSE = 0.05  # of the positions' extent: what RANSAC takes for right
+LOOSE = 0.05  # of the extent of the nearer two thirds of the positions: what RANSAC takes for right
 OUTLIER = 3.0  # standard deviations, as the median of the residuals tells them
 COARSE = 0.1  # of the extent: GPS that errs by more is not taken
 USUAL = 5.0  # units: half of what photographs show is farther away, where nothing tells the scale
 TURNED = 0.7  # cosine: of where photographs have their top, or look, against up
 DOUBT = " (photographs stand upside down there, or look up: are x and y exchanged?)"  # flat positions fit turned over
-NO_UP = " (up from the photographs, as positions lie along a line)"
+NO_TURN = " (along a line: check the turn about it)"  # which the cameras' tops tell alone, or nothing does
 LINE = 0.1  # share of the extent that positions leave a straight line by, below which they do not tell up,
 UNSURE = 0.1  # radians, if they err so much that a turn about the line is off by more
 NUDGE = 1e-7  # of their size: without it, pycolmap finds nothing for points on a line, or on a plane through 0
@@ -85,7 +85,7 @@ def georeference(model: pycolmap.Reconstruction, database: Path, source: str, se
     rest = f"; left out: {few(left_out)}" if left_out else ""
     rest += "; three always fit: give more" * int(right.sum() == LEAST)
     tops, ahead = np.stack([-axes[1], axes[2]]) @ fitted.rotation.matrix()[2]
-    reference += NO_UP * line
+    reference += NO_TURN * line
     reference += DOUBT if tops < -TURNED or (tops < TURNED and ahead > TURNED) else ""
     say(f"coordinates: {reference}, {right.sum()} positions fit within {error:.2g} m (median){rest}")
     return _described(origin, reference, fitted.scale, dict(zip(names, residuals.tolist(), strict=True)), left_out)
@@ -110,16 +110,17 @@ def fit(
     """The similarity that takes camera centers [N, 3] to positions [N, 3], robustly.
 
     Positions along a line leave a turn about it open, as far as they err: ``up`` [3] of the cameras, which goes to z,
-    then closes it.
+    then closes it, unless it goes along the line.
 
     Returns:
         The similarity; residuals [N] in the unit of ``world``; which positions were taken for right [N]; whether these
         lie along a line.
     """
     nudges = NUDGE * np.random.default_rng(seed).normal(size=(2, *world.shape))
-    sizes = [np.median(np.linalg.norm(each - np.median(each, axis=0), axis=1)) for each in (centers, world)]
+    apart = [np.linalg.norm(each - np.median(each, axis=0), axis=1) for each in (centers, world)]
+    sizes = [np.median(each) or each.mean() for each in apart]
     nudged, to = centers + sizes[0] * nudges[0], world + sizes[1] * nudges[1]
-    options = pycolmap.RANSACOptions(max_error=LOOSE * _extent(world) or 1.0, random_seed=seed)
+    options = pycolmap.RANSACOptions(max_error=LOOSE * 1.5 * np.quantile(apart[1], 2 / 3) or 1.0, random_seed=seed)
     found = pycolmap.estimate_sim3d_robust(nudged, to, options)
     right = np.asarray(found["inlier_mask"]) if isinstance(found, dict) else np.ones(len(world), bool)
     fitted, residuals = pycolmap.Sim3d(), np.zeros(len(world))
@@ -129,8 +130,9 @@ def fit(
         right = residuals <= OUTLIER * 1.4826 * np.median(residuals[right]) + 1e-9 * _extent(world)
     middle = centers[right].mean(0)
     _, spans, (along, *_) = np.linalg.svd(centers[right] - middle)
-    unsure = np.median(residuals[right]) + 10 * NUDGE * _extent(world[right])
-    if line := bool(spans[1] < min(LINE * spans[0], unsure / UNSURE / fitted.scale)):
+    unsure = (np.median(residuals[right]) + 10 * NUDGE * _extent(world[right])) * np.sqrt(right.sum()) / fitted.scale
+    line = bool(spans[1] < min(LINE * spans[0], unsure / UNSURE))
+    if line and np.linalg.norm(np.cross(along, up)) > 0.5 * np.linalg.norm(up):  # else up tells no turn about it
         ends = [fitted.rotation * along, UP], [along, up]
         turned = pycolmap.Rotation3d(Rotation.align_vectors(*ends, weights=[np.inf, 1.0])[0].as_matrix())
         fitted = pycolmap.Sim3d(fitted.scale, turned, fitted * middle - fitted.scale * (turned * middle))
@@ -198,16 +200,16 @@ def read_places(path: Path) -> tuple[list[str], list[tuple[list[str], list[float
     """The first line of a CSV file, and of the others the names and the numbers."""
     with reading(path, f"a CSV file that begins with {','.join(POSITIONS)} or {','.join(DISTANCES)}"):
         with path.open(newline="", encoding="utf-8-sig") as file:
-            first, *rows = [[cell.strip() for cell in row] for row in csv.reader(file) if "".join(row).strip()]
+            first, *rows = [[cell.strip() for cell in row] for row in csv.reader(file) if "".join(row).strip()] or [[]]
         if first not in (POSITIONS, DISTANCES):
-            raise Unexpected(f"{','.join(first):.80}")
+            raise Unexpected(f"{','.join(first) or 'nothing':.80}")
         text = 1 if first == POSITIONS else 2
         try:
             found = [(row[:text], [float(cell) for cell in row[text:]]) for row in rows]
         except ValueError as error:
             raise Unexpected(f"a line without numbers ({error})") from error
         for row, (_, numbers) in zip(rows, found, strict=True):
-            if len(row) != len(first) or not np.isfinite(numbers).all():
+            if len(row) != len(first) or not (np.abs(numbers) < 1e12).all():
                 raise Unexpected(f"the line {','.join(row):.80}")
         named, counts = np.unique([names[0] for names, _ in found], return_counts=True)
         if first == POSITIONS and (counts > 1).any():
