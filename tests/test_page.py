@@ -180,12 +180,13 @@ def test_cameras_say_what_is_important(small_chunks):
     splats = some_splats(3000)
     splats.scales[:], splats.opacities[:] = -3.0, 0.0
     (_, camera), *_ = CAMERAS
+    splats.means[0] = camera.center + 0.1 * camera.rotation[2]  # too near to be drawn
     order = importance(splats, [camera])
     away = np.linalg.norm(splats.means - camera.center, axis=1)
     seen = order > 0
     assert 100 < seen.sum() < 2900
     np.testing.assert_array_equal(np.argsort(-order[seen]), np.argsort(away[seen]))
-    assert (splats.means.astype(float) @ camera.rotation[2] + camera.translation[2])[seen].min() > 0
+    assert (splats.means.astype(float) @ camera.rotation[2] + camera.translation[2])[seen].min() > 0 and not seen[0]
 
 
 def test_a_panorama_sees_all_around(small_chunks):

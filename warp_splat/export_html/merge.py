@@ -46,9 +46,9 @@ def importance(splats: SplatArrays, cameras: Sequence[Camera]) -> np.ndarray:
     """
     total = np.zeros(len(splats.means))
     for camera in cameras[:: -(-len(cameras) // MOST_CAMERAS) or 1]:
-        away = np.maximum(np.linalg.norm(splats.means - camera.center, axis=1), NEAR)
-        inside = visible(camera, splats.means, 0.5 * FRUSTUM_MARGIN)  # what is just outside reaches into it
-        total += np.where(inside, camera.fx * camera.fy / away**2, 0.0)
+        away = np.linalg.norm(splats.means - camera.center, axis=1)
+        inside = (away > NEAR) & visible(camera, splats.means, 0.5 * FRUSTUM_MARGIN)  # just outside reaches into it
+        total += np.where(inside, camera.fx * camera.fy / np.maximum(away, NEAR) ** 2, 0.0)
     return sizes(splats) * (total if cameras else 1.0)
 
 

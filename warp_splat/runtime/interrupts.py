@@ -31,8 +31,11 @@ def interruptible() -> Iterator[list[int]]:
 
 
 def ending_as_by_ctrl_c() -> AbstractContextManager[None]:
-    """Let SIGTERM raise as Ctrl-C does, so that what is half written goes, and what is measured is kept."""
-    return _handling((signal.SIGTERM,), signal.default_int_handler)
+    """Let SIGTERM raise as Ctrl-C does, so that what is half written goes, and what is measured is kept.
+
+    Not torchrun's: it would wait for a process that waits for another.
+    """
+    return _handling((signal.SIGTERM,) * ("LOCAL_RANK" not in os.environ), signal.default_int_handler)
 
 
 def leaving_at_once() -> AbstractContextManager[None]:
