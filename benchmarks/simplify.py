@@ -10,8 +10,8 @@ from common import TRAINED, parse, write_table
 from warp_splat.config import FinishedModel
 from warp_splat.formats.splats import SplatArrays
 from warp_splat.pruning.opened import Opened, written_bytes
-from warp_splat.pruning.simplify import squared_error
-from warp_splat.pruning.thinning import fewer_harmonics, tuned
+from warp_splat.pruning.simplify import fewer_harmonics
+from warp_splat.pruning.thinning import tuned
 
 SHARES, STEPS = {"1/2": 1 / 2, "1/3": 1 / 3}, 300
 FORMATS = (".sog", ".spz")
@@ -28,7 +28,7 @@ def rows_of(model: Path) -> list[tuple]:
         count = round(share * len(whole.means))
         splats = tuned(opened.scene, opened.file, opened.setting, count, STEPS, opened.trained)
         rows.append(row_of(opened, name, "all", splats, before))
-        splats = fewer_harmonics(splats, opened.setting, squared_error(opened, splats))
+        splats = fewer_harmonics(opened, splats)
         rows.append(row_of(opened, name, "that show", splats, before))
     return rows
 

@@ -1,6 +1,7 @@
 """Imports point downwards: walks the package's imports and finds none that points up."""
 
 import ast
+import re
 from collections import defaultdict
 from pathlib import Path
 
@@ -101,3 +102,16 @@ def test_no_name_has_two_meanings():
     for name, found in places.items():
         for kind in (modules[name], found - modules[name]):
             assert len(kind) < 2 or name in SAME_MEANING, f"{name}: {sorted(kind)}"
+
+
+def test_scripts_import_what_there_is():
+    for path in (
+        path for folder in ("assets", "benchmarks", "docs") for path in (PACKAGE.parent / folder).rglob("*.py")
+    ):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("warp_splat"):
+                place = PACKAGE.parent / node.module.replace(".", "/")
+                files = [file.stem for file in place.glob("*")] if place.is_dir() else []
+                text = (place / "__init__.py" if place.is_dir() else place.with_suffix(".py")).read_text()
+                known = {*re.findall(r"\w+", text), *files}
+                assert known.issuperset(name.name for name in node.names), path

@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,8 +21,8 @@ from warp_splat.formats.splats import SplatArrays, SplatFile
 from warp_splat.gaussians import GaussianModel
 from warp_splat.pruning.clean import floaters
 from warp_splat.pruning.score import ViewSetting, carried, costs, weights
-from warp_splat.pruning.simplify import bytes_of, degrees_of
-from warp_splat.pruning.thinning import Thinning, fewer_harmonics
+from warp_splat.pruning.simplify import bytes_of, degrees_of, fewer_harmonics
+from warp_splat.pruning.thinning import Thinning
 from warp_splat.raster.api import render
 from warp_splat.scene import load_scene
 from warp_splat.scene.embedded import embedded_scene
@@ -153,17 +154,18 @@ def test_harmonics_that_do_not_show_become_zeros():
     splats.sh[20:25, 1:] *= 1e-4
     setting = setting_of(cameras)
     error = 30.0 * SIZE[0] * SIZE[1] * 3 * 0.01**2  # 40 dB
-    found = fewer_harmonics(splats, setting, error, lambda fewer: True)
+    train, tried = [SimpleNamespace(camera=camera) for camera in cameras], []
+    model = SimpleNamespace(setting=setting, scene=SimpleNamespace(train=train), psnr=lambda *_: 40.0)
+    found = fewer_harmonics(model, splats)
     degrees = degrees_of(found)
     assert (degrees[:10] <= 2).all() and (degrees[10:20] <= 1).all() and (degrees[20:25] == 0).all()
     assert degrees[25:].max() == 3
     changed = len(cameras) * cost(splats, found, setting, cameras[0])
     assert 0 < changed < 1.5 * error * (10 ** (0.02 / 10) - 1)
     np.testing.assert_array_equal(found.sh[found.sh != 0], splats.sh[found.sh != 0])
-    seen = []
-    none = fewer_harmonics(splats, setting, error, lambda fewer: seen.append(degrees_of(fewer).sum()))  # not enough
-    np.testing.assert_array_equal(none.sh, splats.sh)
-    assert len(seen) > 1 and seen == sorted(seen) and seen[0] == degrees.sum()
+    model.psnr = lambda some, _: tried.append(degrees_of(some).sum()) or 40.0
+    np.testing.assert_array_equal(fewer_harmonics(model, splats, 41.0).sh, splats.sh)  # whatever is left out costs more
+    assert len(tried) > 2 and tried[1:] == sorted(tried[1:]) and tried[1] == degrees.sum()
 
 
 def test_floaters_hang_before_few_cameras():

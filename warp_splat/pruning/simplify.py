@@ -4,6 +4,7 @@ import math
 import os
 import re
 import time
+from bisect import bisect_right
 from collections.abc import Callable
 from pathlib import Path
 
@@ -17,12 +18,14 @@ from warp_splat.formats.files import write_csv
 from warp_splat.formats.model_folder import folder_of, is_file_of_gaussians, read_cfg_args
 from warp_splat.formats.splats import COEFFICIENTS, SplatArrays, SplatFile, sizes
 from warp_splat.pruning.opened import Opened, output_of, require_some, write, written_bytes
-from warp_splat.pruning.thinning import HARMONICS_LOSS, Thinning, fewer_harmonics, model_of, tuned
+from warp_splat.pruning.score import costs
+from warp_splat.pruning.thinning import Thinning, model_of, tuned
 from warp_splat.rendering.changes import largest_change
 from warp_splat.rendering.finished import Finished
 from warp_splat.text import format_table, upward
 
 LEVELS = (1.0, 0.8, 0.65, 0.5, 0.4, 0.3, 0.2)  # shares of the Gaussians that the table and the plot show
+HARMONICS_LOSS = 0.02  # dB of the training views that leaving out harmonics may cost
 TRIES = 6  # halvings of the range of counts, for a loss or a size: 1/64 of the Gaussians is left of it
 UNITS = {"": 1, "K": 10**3, "M": 10**6, "G": 10**9}
 UNSEEN = "Without a scene, Gaussians are left out by opacity and extent alone, which costs several times the decibels."
@@ -68,10 +71,7 @@ def simplify(config: SimplifyConfig) -> int:
         count = _count(config, output, file, thinning.to)
     splats = made(count)
     if not config.tolerance:
-        now, pixels = opened.psnr(splats, views), sum(view.camera.width * view.camera.height for view in views)
-        least = before - config.max_loss if config.max_loss else now - HARMONICS_LOSS
-        good = lambda fewer: opened.psnr(fewer, views) >= least  # noqa: E731
-        splats = fewer_harmonics(splats, opened.setting, 3 * pixels * 10 ** (-now / 10), good)
+        splats = fewer_harmonics(opened, splats, before - config.max_loss if config.max_loss else None)
     if config.size and config.steps:  # trained numbers are harder to pack
         thinning = Thinning(splats, opened.setting)
         splats = thinning.to(_count(config, output, file._replace(splats=splats), thinning.to))
@@ -87,6 +87,39 @@ def simplify(config: SimplifyConfig) -> int:
     opened.print_quality(file.splats, splats)
     print(f"  what each share costs: {output.with_suffix('.curve.png')}, .csv")
     return code
+
+
+def fewer_harmonics(opened: Opened, splats: SplatArrays, least: float | None = None) -> SplatArrays:
+    """The Gaussians with zeros for harmonics of degrees that do not show, each from its own degree on.
+
+    What each degree of each Gaussian changes by itself tells which: squares may add up to HARMONICS_LOSS. A quarter of
+    that is tried where the training views lose more.
+
+    Args:
+        opened: the model and its training views.
+        splats: its Gaussians, or some of them.
+        least: PSNR [dB] that these views keep, in place of all but HARMONICS_LOSS.
+    """
+    views, now = opened.scene.train, opened.psnr(splats, opened.scene.train)
+    least = now - HARMONICS_LOSS if least is None else least
+    squares = sum(3 * view.camera.width * view.camera.height for view in views) * 10 ** (-now / 10)
+    allowed = squares * (10 ** (HARMONICS_LOSS / 10) - 1)
+    change = costs(model_of(splats, opened.setting), opened.setting).harmonics.cpu().numpy()
+    bounds = np.unique(np.append(change, 0.0))  # up to one of them a Gaussian's change is accepted
+    while True:
+        larger = bisect_right(bounds, allowed, key=lambda bound: _degrees(change, bound)[1])  # first for which too much
+        kept = np.array(COEFFICIENTS)[_degrees(change, bounds[larger - 1])[0], None] > np.arange(splats.sh.shape[1])
+        fewer = splats._replace(sh=np.where(kept[..., None], splats.sh, np.float32(0)))
+        if larger == 1 or opened.psnr(fewer, views) >= least:
+            return fewer
+        allowed /= 4
+
+
+def _degrees(change: np.ndarray, bound: float) -> tuple[np.ndarray, float]:
+    """The lowest degree of each Gaussian that changes the images by at most ``bound``, and the sum of the changes."""
+    padded = np.column_stack([change, np.zeros(len(change))])
+    degrees = (padded <= bound).argmax(axis=1)
+    return degrees, float(padded[np.arange(len(change)), degrees].sum())
 
 
 def degrees_of(splats: SplatArrays) -> np.ndarray:

@@ -1,8 +1,6 @@
-"""A set of Gaussians in fewer: which to leave out, of which harmonics, and training that makes up for it."""
+"""A set of Gaussians in fewer: which to leave out, and training that makes up for it."""
 
 import math
-from bisect import bisect_right
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -19,7 +17,6 @@ from warp_splat.training.parts import PARTS
 from warp_splat.training.trainer import Trainer
 
 AT_ONCE = 0.8  # of the Gaussians stay, at least, before the rest is judged again: of two that are alike one is needed
-HARMONICS_LOSS = 0.02  # dB of the training views that leaving out harmonics may cost
 STAGES, THINNED = 5, 1 / 3  # of training: how often Gaussians are left out, and over which share of the steps
 #: Rates of that training, three times the default ones. Tried, fox at half size, half (a third) of the Gaussians kept,
 #: 300 steps, held-out PSNR, 31.57 dB before:
@@ -67,35 +64,6 @@ def _costliest(model: GaussianModel, setting: ViewSetting, count: int) -> torch.
     """Indices of the Gaussians, ascending, without which the images would change most."""
     order = torch.sort(costs(model, setting).gaussians, descending=True, stable=True).indices
     return torch.sort(order[:count]).values
-
-
-def fewer_harmonics(splats: SplatArrays, setting: ViewSetting, error: float, good: Callable) -> SplatArrays:
-    """The Gaussians with zeros for harmonics of degrees that do not show, each from its own degree on.
-
-    Args:
-        splats: the Gaussians.
-        setting: the training views.
-        error: squared, of their images against the photographs, summed over pixels and channels, colors 0..1. It may
-            grow by HARMONICS_LOSS, as the change by each degree of each Gaussian alone tells.
-        good: tells of such Gaussians whether they are; if not, a quarter of that growth is tried.
-    """
-    change = costs(model_of(splats, setting), setting).harmonics.cpu().numpy()
-    allowed = error * (10 ** (HARMONICS_LOSS / 10) - 1)
-    bounds = np.unique(np.append(change, 0.0))  # up to one of them a Gaussian's change is accepted
-    while True:
-        larger = bisect_right(bounds, allowed, key=lambda bound: _degrees(change, bound)[1])  # first for which too much
-        kept = np.array(COEFFICIENTS)[_degrees(change, bounds[larger - 1])[0], None] > np.arange(splats.sh.shape[1])
-        fewer = splats._replace(sh=np.where(kept[..., None], splats.sh, np.float32(0)))
-        if larger == 1 or good(fewer):
-            return fewer
-        allowed /= 4
-
-
-def _degrees(change: np.ndarray, bound: float) -> tuple[np.ndarray, float]:
-    """The lowest degree of each Gaussian that changes the images by at most ``bound``, and the sum of the changes."""
-    padded = np.column_stack([change, np.zeros(len(change))])
-    degrees = (padded <= bound).argmax(axis=1)
-    return degrees, float(padded[np.arange(len(change)), degrees].sum())
 
 
 def tuned(scene: Scene, file: SplatFile, setting: ViewSetting, count: int, steps: int, trained: dict) -> SplatArrays:
