@@ -115,6 +115,16 @@ def test_what_positions_do_not_tell_cameras_do(tmp_path, spans, ahead, noise, wr
     assert ("check the turn about it" in told[0]) == line and {f"{i}.jpg" for i in range(wrong)} <= {*found["left_out"]}
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_most_may_stand_in_one_place(tmp_path, seed):
+    """Near each other, compared with how positions err, and the others around them."""
+    random = np.random.default_rng(seed)
+    centers = random.uniform(-1, 1, (COUNT, 3)) * np.where(np.arange(COUNT) < 12, 0.4, 20)[:, None]
+    model, noisy = model_of(centers, random), centers + UTM + 0.2 * random.normal(size=(COUNT, 3))
+    found = georeference(model, tmp_path, write_positions(tmp_path / "a.csv", noisy), 0, print)
+    assert np.linalg.norm(placed(model, found) - centers - UTM, axis=1).max() < 1
+
+
 @pytest.mark.parametrize("looks", ["level", "down"])
 def test_axes_that_may_be_exchanged_are_told(tmp_path, looks):
     """What is flat turns over where x and y are exchanged: a mirror is no rotation."""
@@ -166,6 +176,7 @@ def test_distances_give_the_scale_and_cameras_the_up_and_unknown_names_are_told(
         ("", "name,other,distance, found nothing"),
         ("x,y\n1,2", "expected a CSV file that begins with name,x,y,z"),
         ("name,x,y,z\na.jpg,1,2,1e300", "found the line a.jpg,1,2,1e300"),
+        ('name,x,y,z\n"' + "a.jpg,1,2,3\n" * 20_000, "field larger than field limit"),
         ("name,x,y,z\na.jpg,1,2", "found the line a.jpg,1,2"),
         ("name,x,y,z\na.jpg,1,2,b", "without numbers"),
         ("name,x,y,z\na.jpg,1,2,3\nb.jpg,1,nan,3", "found the line b.jpg,1,nan,3"),

@@ -20,6 +20,7 @@ from warp_splat.formats.model_folder import ply_path, write_cfg_args
 from warp_splat.formats.splats import SplatArrays, SplatFile
 from warp_splat.gaussians import GaussianModel
 from warp_splat.pruning.clean import floaters
+from warp_splat.pruning.opened import Opened
 from warp_splat.pruning.score import ViewSetting, carried, costs, weights
 from warp_splat.pruning.simplify import bytes_of, degrees_of, fewer_harmonics
 from warp_splat.pruning.thinning import Thinning
@@ -163,9 +164,16 @@ def test_harmonics_that_do_not_show_become_zeros():
     changed = len(cameras) * cost(splats, found, setting, cameras[0])
     assert 0 < changed < 1.5 * error * (10 ** (0.02 / 10) - 1)
     np.testing.assert_array_equal(found.sh[found.sh != 0], splats.sh[found.sh != 0])
-    model.psnr = lambda some, _: tried.append(degrees_of(some).sum()) or 40.0
-    np.testing.assert_array_equal(fewer_harmonics(model, splats, 41.0).sh, splats.sh)  # whatever is left out costs more
+    model.psnr = lambda some, _: tried.append(degrees_of(some).sum()) or 40.0 - (len(tried) > 1)
+    np.testing.assert_array_equal(fewer_harmonics(model, splats).sh, splats.sh)  # whatever is left out costs more
     assert len(tried) > 2 and tried[1:] == sorted(tried[1:]) and tried[1] == degrees.sum()
+    np.testing.assert_array_equal(fewer_harmonics(model, splats, 50.0).sh, splats.sh)  # there is nothing to spend
+
+
+def test_a_view_that_is_drawn_exactly_hides_no_other():
+    views = [SimpleNamespace(camera=0, name=name, picture=np.zeros((4, 4, 3), np.uint8), mask=None) for name in "ab"]
+    model = SimpleNamespace(picture_of=lambda _: lambda camera, name: np.full((4, 4, 3), 10 * (name == "b"), np.uint8))
+    assert Opened.psnr(model, None, views) == pytest.approx((99 + 20 * np.log10(25.5)) / 2)
 
 
 def test_floaters_hang_before_few_cameras():

@@ -71,9 +71,9 @@ class Opened(Finished):
         return self.picture(GaussianModel.from_splats(splats).to(self.setting.background.device), self.scene)
 
     def psnr(self, splats: SplatArrays, views: list[View]) -> float:
-        """Mean PSNR [dB] of 8-bit renders."""
+        """Mean PSNR [dB] of 8-bit renders; of one that is its photograph, 99 dB."""
         picture = self.picture_of(splats)
-        return float(np.mean([psnr(picture(view.camera, view.name), view.picture, view.mask) for view in views]))
+        return float(np.mean([min(psnr(picture(v.camera, v.name), v.picture, v.mask), 99.0) for v in views]))
 
     def print_quality(self, before: SplatArrays, after: SplatArrays) -> None:
         """A line for the training views and, if there are any, for those held out."""

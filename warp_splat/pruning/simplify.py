@@ -69,7 +69,7 @@ def simplify(config: SimplifyConfig) -> int:
         _, count = _narrowed(0, total, lambda count: opened.psnr(made(count), views) < enough)
     else:
         count = _count(config, output, file, thinning.to)
-    splats = made(count)
+    splats = file.splats if config.max_loss and count == total else made(count)  # none of which was measured
     if not config.tolerance:
         splats = fewer_harmonics(opened, splats, before - config.max_loss if config.max_loss else None)
     if config.size and config.steps:  # trained numbers are harder to pack
@@ -103,7 +103,7 @@ def fewer_harmonics(opened: Opened, splats: SplatArrays, least: float | None = N
     views, now = opened.scene.train, opened.psnr(splats, opened.scene.train)
     least = now - HARMONICS_LOSS if least is None else least
     squares = sum(3 * view.camera.width * view.camera.height for view in views) * 10 ** (-now / 10)
-    allowed = squares * (10 ** (HARMONICS_LOSS / 10) - 1)
+    allowed = squares * (10 ** (HARMONICS_LOSS / 10) - 1) * (now >= least)
     change = costs(model_of(splats, opened.setting), opened.setting).harmonics.cpu().numpy()
     bounds = np.unique(np.append(change, 0.0))  # up to one of them a Gaussian's change is accepted
     while True:
@@ -190,7 +190,7 @@ def _curve(opened: Opened, thinning: Thinning, output: Path) -> None:
             "Gaussians": len(splats.means),
             "MB": written_bytes(output, opened.file._replace(splats=splats)) / 1e6,
             "frames_per_second": len(views) / seconds,
-            f"{name}_PSNR": float(np.mean([psnr(render, view.picture, view.mask) for render, view in pairs])),
+            f"{name}_PSNR": float(np.minimum([psnr(render, v.picture, v.mask) for render, v in pairs], 99.0).mean()),
         }
         rows.append(row)
     lines = [[f"{value:.2f}" if isinstance(value, float) else value for value in row.values()] for row in rows]

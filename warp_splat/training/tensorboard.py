@@ -24,8 +24,7 @@ class EventLog:
         if folder:
             self.library = tensorboard_library()
             self.file = self.library.event_file_writer.EventsWriter(str(folder / "events"))
-            session = self.library.proto.event_pb2.SessionLog
-            self._add(begun + 1, session_log=session(status=session.START))
+            self._add(begun + 1, session_log={"status": "START"})
 
     def write(self, points: Iterable[tuple[int, str, float]]) -> None:
         """Points of curves: iteration, name of the curve, value. They end with a warning where the disk is full."""
