@@ -125,6 +125,15 @@ def test_most_may_stand_in_one_place(tmp_path, seed):
     assert np.linalg.norm(placed(model, found) - centers - UTM, axis=1).max() < 1
 
 
+def test_a_camera_that_strays_is_left_out(tmp_path):
+    random = np.random.default_rng(3)
+    centers = random.uniform(-20, 20, (COUNT, 3)) * (1, 1, 0.1)
+    source = write_positions(tmp_path / "a.csv", centers + UTM + 0.2 * random.normal(size=(COUNT, 3)))
+    centers[0] += (1000, 0, 0)
+    found = georeference(model_of(centers, random), tmp_path, source, 0, print)
+    assert found["left_out"][0] == "0.jpg" and len(found["left_out"]) < 4
+
+
 @pytest.mark.parametrize("looks", ["level", "down"])
 def test_axes_that_may_be_exchanged_are_told(tmp_path, looks):
     """What is flat turns over where x and y are exchanged: a mirror is no rotation."""

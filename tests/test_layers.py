@@ -3,6 +3,7 @@
 import ast
 import re
 from collections import defaultdict
+from itertools import chain
 from pathlib import Path
 
 import pytest
@@ -105,9 +106,8 @@ def test_no_name_has_two_meanings():
 
 
 def test_scripts_import_what_there_is():
-    for path in (
-        path for folder in ("assets", "benchmarks", "docs") for path in (PACKAGE.parent / folder).rglob("*.py")
-    ):
+    scripts = [(PACKAGE.parent / folder).rglob("*.py") for folder in ("assets", "benchmarks", "docs")]
+    for path in chain(*scripts):
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("warp_splat"):
                 place = PACKAGE.parent / node.module.replace(".", "/")

@@ -69,7 +69,7 @@ def simplify(config: SimplifyConfig) -> int:
         _, count = _narrowed(0, total, lambda count: opened.psnr(made(count), views) < enough)
     else:
         count = _count(config, output, file, thinning.to)
-    splats = file.splats if config.max_loss and count == total else made(count)  # none of which was measured
+    splats = file.splats if config.max_loss and count == total else made(count)  # no fewer keep it
     if not config.tolerance:
         splats = fewer_harmonics(opened, splats, before - config.max_loss if config.max_loss else None)
     if config.size and config.steps:  # trained numbers are harder to pack

@@ -17,7 +17,7 @@ from warp_splat.text import Report, few
 POSITIONS, DISTANCES = ["name", "x", "y", "z"], ["name", "other", "distance"]  # first lines of files
 LEAST = 3  # positions
 UP = np.array((0.0, 0.0, 1.0))  # in the world
-LOOSE = 0.05  # of the cameras' extent, in the scale of the nearer two thirds: what RANSAC takes for right
+LOOSE = 0.05  # of the extent: what RANSAC takes for right
 OUTLIER = 3.0  # standard deviations, as the median of the residuals tells them
 COARSE = 0.1  # of the extent: GPS that errs by more is not taken
 USUAL = 5.0  # units: half of what photographs show is farther away, where nothing tells the scale
@@ -117,11 +117,12 @@ def fit(
         lie along a line.
     """
     nudges = NUDGE * np.random.default_rng(seed).normal(size=(2, *world.shape))
-    apart = [np.linalg.norm(each - np.median(each, axis=0), axis=1) for each in (centers, world)]
-    sizes = [np.median(each) or each.mean() for each in apart]
+    off = [np.linalg.norm(each - np.median(each, axis=0), axis=1) for each in (centers, world)]
+    sizes = [np.median(each) or each.mean() for each in off]
     nudged, to = centers + sizes[0] * nudges[0], world + sizes[1] * nudges[1]
-    scale = np.quantile(apart[1], 2 / 3) / (np.quantile(apart[0], 2 / 3) or apart[0].max() or 1.0)
-    options = pycolmap.RANSACOptions(max_error=LOOSE * scale * apart[0].max() or 1.0, random_seed=seed)
+    unit = np.quantile(off[1], 2 / 3) / (np.quantile(off[0], 2 / 3) or off[0].max() or 1.0)
+    # what strays in one of them does not count
+    options = pycolmap.RANSACOptions(max_error=LOOSE * np.minimum(unit * off[0], off[1]).max() or 1.0, random_seed=seed)
     found = pycolmap.estimate_sim3d_robust(nudged, to, options)
     right = np.asarray(found["inlier_mask"]) if isinstance(found, dict) else np.ones(len(world), bool)
     fitted, residuals = pycolmap.Sim3d(), np.zeros(len(world))

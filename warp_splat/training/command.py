@@ -155,7 +155,7 @@ def _restore_or_begin(trainer: Trainer, run: Run, begun: Checkpoint | None, say:
     if leads:  # only now: where a checkpoint is refused, the folder stays as it was
         opening.write_inputs(run.folder, config, trainer.scene, begun)
     if leads and config.report.tensorboard:
-        run.events = EventLog(run.folder, run.iteration)
+        run.events = EventLog(run.folder, run.iteration - len(run.losses) * trainer.processes.images)
     if config.machine.device == "cpu":
         say(memory.describe(trainer)[0])
 
