@@ -18,7 +18,7 @@ from warp_splat.cli import main
 from warp_splat.errors import InputError
 from warp_splat.evaluation import report
 from warp_splat.evaluation.metrics import METRICS, psnr
-from warp_splat.formats.checkpoint import save_checkpoint
+from warp_splat.formats.checkpoint import LAST, save_checkpoint
 from warp_splat.formats.model_folder import ply_path
 from warp_splat.formats.ply import save_ply
 from warp_splat.formats.png import load_png, save_png, save_video
@@ -323,23 +323,48 @@ def test_configuration_that_was_written_trains_the_same_bytes(told, tmp_path, ca
     assert (tmp_path / "config.toml").read_text() == quiet
 
 
-def test_event_files_hold_every_loss(told):
-    """Records of TFRecord: length, a checksum of it, an event, a checksum of that."""
+def curves(folder):
+    """Curves as TensorBoard shows them: where a session starts, what others logged from that step on is purged.
+
+    A file holds records of TFRecord: length, a checksum of it, an event, a checksum of that.
+    """
     event_pb2 = pytest.importorskip("tensorboardX.proto.event_pb2")
-    (file,) = told.glob("events.out.tfevents.*")
-    found, rest = {}, file.read_bytes()
-    while rest:
-        (length,) = struct.unpack_from("<Q", rest)
-        event = event_pb2.Event.FromString(rest[12 : 12 + length])
-        rest = rest[16 + length :]
-        for value in event.summary.value:
-            found.setdefault(value.tag, {})[event.step] = value.simple_value
+    found = {}
+    for file in sorted(folder.glob("events.out.tfevents.*")):
+        rest = file.read_bytes()
+        while rest:
+            (length,) = struct.unpack_from("<Q", rest)
+            event = event_pb2.Event.FromString(rest[12 : 12 + length])
+            rest = rest[16 + length :]
+            if event.session_log.status == event_pb2.SessionLog.START:
+                found = {tag: [at for at in curve if at[0] < event.step] for tag, curve in found.items()}
+            for value in event.summary.value:
+                found.setdefault(value.tag, []).append((event.step, value.simple_value))
+    return found
+
+
+def test_event_files_hold_every_loss(told):
+    found = curves(told)
     history = json.loads((told / "history.json").read_text())
-    assert list(found["train/loss"]) == list(range(1, 21))
-    assert np.mean([*found["train/loss"].values()]) == pytest.approx(np.mean([record["loss"] for record in history]))
-    assert found["gaussians"] == {record["iteration"]: record["gaussians"] for record in history}
+    steps, losses = zip(*found["train/loss"], strict=True)
+    assert steps == tuple(range(1, 21))
+    assert np.mean(losses) == pytest.approx(np.mean([record["loss"] for record in history]))
+    assert found["gaussians"] == [(record["iteration"], record["gaussians"]) for record in history]
     results = json.loads((told / "results.json").read_text())["ours_20"]
-    assert found["test/FLIP"][20] == pytest.approx(results["FLIP"])
+    assert dict(found["test/FLIP"])[20] == pytest.approx(results["FLIP"])
+
+
+def test_curves_go_on_from_a_checkpoint(told, tmp_path):
+    """Losses that were not yet written with it are written again, in place of what the stopped run wrote later."""
+    folder = tmp_path / "model"
+    options = ["--tensorboard", "--quiet", "--checkpoint_iterations", "7", "--test_iterations", "20"]
+    assert main(["train", "-s", str(SCENE), "-m", str(folder), *SHORT, *options]) == 0
+    (file,) = folder.glob("events.out.tfevents.*")
+    file.rename(file.with_name("events.out.tfevents.0"))  # files of one second bear one name
+    ply_path(folder, 20).unlink()  # as if killed before the end
+    (folder / "chkpnt7.safetensors").rename(folder / LAST)
+    assert main(["train", "--resume", str(folder)]) == 0
+    assert curves(folder)["train/loss"] == curves(told)["train/loss"]
 
 
 def test_curves_end_where_the_disk_is_full(tmp_path, capsys):
