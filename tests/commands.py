@@ -4,9 +4,12 @@ import io
 import multiprocessing
 import os
 import re
+import runpy
 import signal
+import socket
 import subprocess
 import sys
+import tempfile
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -59,6 +62,28 @@ def forking():
     processes = multiprocessing.get_context("forkserver")
     processes.set_forkserver_preload(["warp_splat.training.command"])
     return processes
+
+
+def _as_torchrun_starts_it(group, said, words):
+    os.environ.update(group)
+    os.dup2(said := os.open(said, os.O_WRONLY | os.O_APPEND | os.O_CREAT), 1)
+    os.dup2(said, 2)
+    sys.argv = list(words)
+    runpy.run_path(words[0], run_name="__main__")
+
+
+def together(count, *words):
+    """A script by so many processes, as torchrun starts them, which takes longer: their exit codes, what they said."""
+    with tempfile.TemporaryDirectory() as folder, socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        every = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free.getsockname()[1]), "WORLD_SIZE": str(count)}
+        free.close()
+        said = Path(folder) / "said.txt"
+        ranks = [{**every, "LOCAL_WORLD_SIZE": str(count), "RANK": str(n), "LOCAL_RANK": str(n)} for n in range(count)]
+        processes = [forked_process(_as_torchrun_starts_it, rank, said, [*map(str, words)]) for rank in ranks]
+        for process in processes:
+            process.join(PATIENCE)
+        return [process.exitcode for process in processes], said.read_text()
 
 
 def forked_process(target, *arguments):

@@ -15,11 +15,10 @@ import numpy as np
 import pytest
 import safetensors.numpy
 import torch
-from commands import ROOT, SCENE, SHORT, forked_process, interrupt, no_space, train
+from commands import ROOT, SCENE, SHORT, forked_process, interrupt, no_space, together, train
 from hostile import refusal
 from scene_files import pose, write_colmap
 from splat_files import some_splats
-from test_distributed import torchrun
 from trainings import SCHEDULE, Pretended, begin, check_same, resumed, state_of, stepped, steps
 
 from warp_splat.cli import main, parse
@@ -310,11 +309,10 @@ def test_other_numbers_of_processes(scene, stopped, tmp_path):
 @pytest.mark.long
 def test_two_processes_stop_and_resume(tmp_path):
     """The same bytes as without a stop; one process goes on as well."""
-
-    program = ROOT / "train.py"
-    torchrun(program, "-s", SCENE, "-m", tmp_path / "whole", *SHORT)
-    torchrun(program, "-s", SCENE, "-m", tmp_path / "parts", *SHORT, "--iterations", "34")
-    torchrun(program, "--resume", tmp_path / "parts", "--iterations", "60")
+    begin = ["-s", SCENE, *SHORT, "-m"]
+    runs = [[*begin, tmp_path / "whole"], [*begin, tmp_path / "parts", "--iterations", "34"]]
+    for run in [*runs, ["--resume", tmp_path / "parts", "--iterations", "60"]]:
+        assert together(2, ROOT / "train.py", *run)[0] == [0, 0]
     assert ply_path(tmp_path / "parts", 60).read_bytes() == ply_path(tmp_path / "whole", 60).read_bytes()
     assert main(["train", "--resume", str(tmp_path / "parts"), "--iterations", "65", "--quiet"]) == 0
     assert ply_path(tmp_path / "parts", 65).is_file()

@@ -11,7 +11,7 @@ import numpy as np
 import psutil
 import pytest
 import torch
-from commands import ROOT, SCENE, python, started
+from commands import ROOT, SCENE, python, started, together
 from torchrun_steps import CONFIG, STEPS
 from trainings import Pretended
 
@@ -23,11 +23,6 @@ from warp_splat.training.options import TrainConfig
 from warp_splat.training.trainer import Trainer
 
 TORCHRUN = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
-
-
-def torchrun(*arguments) -> str:
-    """What a run of two processes prints."""
-    return python(*TORCHRUN, *arguments).stdout
 
 
 def gradients_of_ranks(trainers, iteration):
@@ -48,7 +43,7 @@ def gradients_of_ranks(trainers, iteration):
 )
 def test_a_step_of_two_processes_is_one_of_their_mean_gradient(optimizer_type, scene, tmp_path):
     """Against one process that differentiates both views, averages, and steps by Adam with the rates written out."""
-    torchrun(ROOT / "tests" / "torchrun_steps.py", tmp_path, SCENE, optimizer_type)
+    assert together(2, ROOT / "tests" / "torchrun_steps.py", tmp_path, SCENE, optimizer_type)[0] == [0, 0]
     load = lambda rank, step, what: dict(np.load(tmp_path / f"rank{rank}_step{step}_{what}.npz"))  # noqa: E731
     config = TrainConfig(optimizer_type=optimizer_type, **CONFIG)
     trainers = [Trainer(scene, config, Pretended(rank, 2)) for rank in (0, 1)]
@@ -194,8 +189,8 @@ def test_other_options_of_a_process_are_told_before_the_first_step(options, foun
     script = tmp_path / "others.py"
     script.write_text(OTHERS.replace("OPTIONS", str(options)))
     given = ["--shard", "-s", SCENE, "-m", tmp_path / "model", "-r", "8", "--iterations", "20", "--quiet"]
-    run = python(*TORCHRUN, script, *given, check=False)
-    assert run.returncode != 0 and f"Process 1: expected {found}" in run.stderr
+    ends, said = together(2, script, *given)
+    assert all(ends) and f"Process 1: expected {found}" in said
     assert not list((tmp_path / "model").rglob("*"))
 
 
@@ -209,8 +204,8 @@ def test_a_whole_run_of_two_processes(tmp_path):
     )
     options += "--parts sky,exposure,pose,depth,floaters --exposure affine --vignetting --pose_intrinsics focal "
     options += "--opacity_reset_interval 40 --sh_interval 15 --densify_grad_threshold 0.00005 --profile 10"
-    out = torchrun(ROOT / "train.py", "-s", SCENE, "-m", tmp_path, *options.split())
-    assert out.count("Done after 60 iterations") == 1 and "all-reduce" in out
+    ends, said = together(2, ROOT / "train.py", "-s", SCENE, "-m", tmp_path, *options.split())
+    assert ends == [0, 0] and said.count("Done after 60 iterations") == 1 and "all-reduce" in said
     entry = json.loads((tmp_path / "results.json").read_text())["ours_60"]  # 59 rounded up to whole steps
     assert entry["processes"] == 2 and entry["gaussians"] > 4500
     quality = {record["iteration"]: record["psnr"] for record in json.loads((tmp_path / "history.json").read_text())}

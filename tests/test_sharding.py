@@ -11,7 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 import torch
-from commands import ROOT, SCENE, python
+from commands import ROOT, SCENE, together
 from hostile import refusal
 from scene_files import write_colmap
 
@@ -122,8 +122,8 @@ def train(folder, count, options):
     """The model of a training by ``count`` processes, of which each holds a block; of one, that holds it all."""
     command = ["train", "-m", str(folder), *options.split()]
     if count > 1:
-        torchrun = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", count, ROOT / "train.py"]
-        python(*torchrun, *command[1:], "--shard", "--viewer")
+        ends, said = together(count, ROOT / "train.py", *command[1:], "--shard", "--viewer")
+        assert ends == [0] * count, said
     else:
         assert main([*command, "--no-shard"]) == 0
     (model,) = folder.glob("point_cloud/*/point_cloud.ply")
