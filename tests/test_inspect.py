@@ -156,6 +156,7 @@ def two_of_one_stem(path):
             ("warning", "duplicates"),
             "view_003.png = view_004.png",
         ),
+        (in_photo(lambda path: write_image(path, 0 * texture(264, 248))), ("warning", "contents"), "1 of 50"),
         (in_photo(lambda path: write_image(path, texture(264, 248, 4))), ("warning", "alpha"), "1 of 50"),
         (
             lambda s: write_image(s / "masks" / "view_003.png.png", texture(264, 248, 1)),

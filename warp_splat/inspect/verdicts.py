@@ -115,6 +115,13 @@ def check_masks(subject: Subject) -> Iterator[Finding]:
         yield Finding("masks", "ok", "no alpha channels and no masks.")
 
 
+def check_contents(subject: Subject) -> Iterator[Finding]:
+    """Photographs that show nothing, as those of a covered lens."""
+    if plain := [name for name, small in subject.thumbnails.items() if (small == small[0, 0]).all()]:
+        text = f"{len(plain)} of {len(subject.photos)} images have one color all over: {few(plain)}."
+        yield Finding("contents", "warning", text)
+
+
 def check_loading(subject: Subject) -> Iterator[Finding]:
     """What training itself would say of this scene before its first step."""
     notes: list[str] = []
@@ -139,4 +146,4 @@ def check_loading(subject: Subject) -> Iterator[Finding]:
 
 
 #: What is checked once the points are: see geometry.py.
-CHECKS = (check_coordinates, check_names, check_masks, check_loading)
+CHECKS = (check_coordinates, check_names, check_masks, check_contents, check_loading)
