@@ -119,8 +119,7 @@ def seen_targets(monkeypatch, scene, steps, **options):
 
     monkeypatch.setattr("warp_splat.training.trainer.image_loss", spy)
     for iteration in range(1, steps + 1):
-        trainer.differentiate(iteration)
-        trainer.update(iteration)
+        trainer.advance(iteration)
     return found
 
 
@@ -167,9 +166,8 @@ def test_floats_are_linear_light(tmp_path, monkeypatch):
         np.testing.assert_allclose(target, expected, atol=2e-6)
         assert image.isfinite().all()
     trainer = Trainer(scene, TrainConfig(device="cpu"))
-    for iteration in range(1, 30):
-        loss = trainer.differentiate(iteration)
-        trainer.update(iteration)
+    for iteration in range(1, 31):
+        loss = trainer.advance(iteration)
     assert loss.isfinite() and all(tensor.isfinite().all() for tensor in trainer.model.parameters.values())
 
 

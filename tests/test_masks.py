@@ -185,8 +185,7 @@ def test_training_does_not_see_what_is_masked(tmp_path, coarse):
         for name in "abc":
             write_image(root / "masks" / f"{name}.png", mask)
         trainer = Trainer(load(root)[0], TrainConfig(device="cpu", coarse=coarse, iterations=6))
-        for iteration in range(1, 6):
-            trainer.differentiate(iteration)
-            trainer.update(iteration)
+        for iteration in range(1, 7):
+            trainer.advance(iteration)
         models.append(trainer.model.parameters)
     assert all(torch.equal(models[0][name], models[1][name]) for name in models[0])

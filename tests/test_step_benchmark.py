@@ -135,8 +135,7 @@ def test_degree_rises_without_a_compilation(monkeypatch, capsys):
     assert "Module" in capsys.readouterr().out  # what the test looks for is there
     degrees = set()
     for iteration in range(1, 9):
-        trainer.differentiate(iteration)
-        trainer.update(iteration)
+        trainer.advance(iteration)
         degrees.add(trainer.degree)
     assert degrees == {0, 1, 2, 3} and "Module" not in capsys.readouterr().out
 

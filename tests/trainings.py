@@ -44,9 +44,7 @@ def begin(scene, folder, **options):
 def steps(trainer, run, end, watch=lambda: None):
     """Train until the loss of iteration ``end`` is differentiated, which is where models and checkpoints are saved."""
     for iteration in range(run.iteration + 1, end + 1):
-        if run.iteration:
-            trainer.update(run.iteration)
-        run.losses.append(trainer.differentiate(iteration))
+        run.losses.append(trainer.advance(iteration))
         run.iteration = iteration
         watch()
 

@@ -1,8 +1,8 @@
 """The training loop: a step, then what is due between two steps.
 
-A step is two methods of the trainer. ``update`` changes the model by the gradients of the step before, and
-``differentiate`` finds those of another view. Between two steps the held-out views are measured, models and checkpoints
-are written, and the viewer draws. This page and those two methods are the whole of a training.
+A step is two methods of the trainer, which ``advance`` calls: ``update`` changes the model by the gradients of the step
+before, and ``differentiate`` finds those of another view. Between two steps the held-out views are measured, models and
+checkpoints are written, and the viewer draws. This page and those two methods are the whole of a training.
 """
 
 import sys
@@ -42,9 +42,7 @@ def train_steps(trainer: Trainer, run: Run, interrupted: list[int], viewer: "Tra
                 stages.clear()
                 unprofiled = run.iteration, run.seconds
             start = time.perf_counter()
-            if run.iteration:  # now, since models and checkpoints are those of before the update
-                trainer.update(run.iteration)
-            run.losses.append(trainer.differentiate(iteration))
+            run.losses.append(trainer.advance(iteration))  # models and checkpoints are of before its update
             run.iteration = iteration
             done = time.perf_counter()
             run.seconds += done - start

@@ -199,8 +199,8 @@ class Trainer:
 
     def advance(self, iteration: int) -> torch.Tensor:
         """:meth:`update` after the step before, if there was one, then :meth:`differentiate`; returns the loss."""
-        if iteration > 1:
-            self.update(iteration - 1)
+        if (before := iteration - self.processes.images) > 0:
+            self.update(before)
         return self.differentiate(iteration)
 
     def settle(self, begin: int, cooldown: int) -> None:
