@@ -151,8 +151,7 @@ def test_any_number_of_threads(threads):
     for count in (1, 3):
         threads(count)
         found.append([*surface(agreed(views)), *(view.depth for view in filled(wrong, agreed(wrong), photographs))])
-    for one, other in zip(*found, strict=True):
-        np.testing.assert_array_equal(one, other)
+    torch.testing.assert_close(*found, rtol=0, atol=0)
 
 
 def test_depths_that_others_do_not_see():
@@ -180,8 +179,7 @@ def test_holes_are_closed(threads, seen):
     for count in (1, 2):
         threads(count)
         found.append(surface_in(box, views, VOXEL, True))
-    for one, other in zip(*found, strict=True):
-        np.testing.assert_array_equal(one, other)
+    np.testing.assert_equal(*found)
     mesh, opened = (trimesh.Trimesh(*each[:2], process=False) for each in (found[0], surface(views)))
     assert mesh.is_watertight and not opened.is_watertight and mesh.volume > 4
     assert trimesh.proximity.ProximityQuery(mesh).vertex(opened.vertices)[0].max() < VOXEL

@@ -89,8 +89,7 @@ def test_those_left_out_have_no_influence(name):
     outputs, (grads,) = project(100, OPTIONS[name], left_out=0.0)
     left_out = outputs.radii <= 0
     _, (others,) = project(100, OPTIONS[name], left_out=torch.nan)
-    for grad, other in zip(grads, others, strict=True):
-        torch.testing.assert_close(grad, other, rtol=0, atol=0)
+    torch.testing.assert_close(grads, others, rtol=0, atol=0)
     for tensor in (*outputs[:-1], *grads):
         assert not tensor[left_out].any()
 
@@ -117,8 +116,7 @@ def test_quaternions_of_any_norm(exponent):
     outputs, grad = derived(1.0)
     scaled, scaled_grad = derived(2.0**exponent)
     assert (outputs.radii > 0).sum() > 3
-    for found, wanted in zip(scaled, outputs, strict=True):
-        torch.testing.assert_close(found, wanted, rtol=0, atol=0)
+    torch.testing.assert_close(scaled, outputs, rtol=0, atol=0)
     torch.testing.assert_close(scaled_grad * 2.0**exponent, grad, rtol=1e-6, atol=0)
 
 
@@ -154,15 +152,13 @@ def test_colors_far_from_the_origin(center):
 
 def test_gradients_can_be_asked_for_twice():
     _, (first, second) = project(37, OPTIONS["plain"], sets=2)
-    for found, wanted in zip(second, first, strict=True):
-        torch.testing.assert_close(found, wanted, rtol=0, atol=0)
+    torch.testing.assert_close(second, first, rtol=0, atol=0)
 
 
 def test_inputs_need_not_be_contiguous():
     outputs, (grads,) = project(40, OPTIONS["plain"])
     others, (other_grads,) = project(40, OPTIONS["plain"], spread=True)
-    for found, wanted in zip((*others, *other_grads), (*outputs, *grads), strict=True):
-        torch.testing.assert_close(found, wanted, rtol=0, atol=0)
+    torch.testing.assert_close((others, other_grads), (outputs, grads), rtol=0, atol=0)
 
 
 @pytest.mark.parametrize(
