@@ -195,9 +195,7 @@ FAILURES = {
 )
 def test_when_a_host_fails_all_end_and_fewer_go_on(failure, hosts, tmp_path):
     fail, said = FAILURES[failure]
-    for host in hosts:
-        host.start(tmp_path / "hosts", ENDLESS)
-    until(lambda: iteration(tmp_path / "hosts") > 0, 150, hosts)
+    begin(hosts, tmp_path / "hosts")
     fail(hosts)
     ending = hosts[:1] if failure in ("dies", "hangs") else hosts  # a second host that can
     begun = time.monotonic()
@@ -213,9 +211,7 @@ def test_when_a_host_fails_all_end_and_fewer_go_on(failure, hosts, tmp_path):
 
 def test_all_that_stand_still_for_a_while_go_on(hosts, tmp_path):
     """As after Ctrl-Z and fg: none takes the others for hung."""
-    for host in hosts:
-        host.start(tmp_path / "hosts", ENDLESS)
-    until(lambda: iteration(tmp_path / "hosts") > 0, 150, hosts)
+    begin(hosts, tmp_path / "hosts")
     for sent in (signal.SIGSTOP, signal.SIGCONT):
         for process in [process for host in hosts for process in host.processes()]:
             process.send_signal(sent)
@@ -239,9 +235,7 @@ def test_a_full_disk_on_one_host_costs_a_checkpoint(hosts, tmp_path):
 def test_torchrun_restarts_from_the_last_checkpoint(hosts, tmp_path, monkeypatch):
     """With a new store for each start: one that stays has the addresses of processes that have gone."""
     monkeypatch.setenv("TORCH_DISABLE_SHARE_RDZV_TCP_STORE", "1")
-    for host in hosts:
-        host.start(tmp_path / "hosts", ENDLESS, "--max-restarts", "1")
-    until(lambda: iteration(tmp_path / "hosts") > 0, 150, hosts)
+    begin(hosts, tmp_path / "hosts", "--max-restarts", "1")
     hosts[1].processes()[0].kill()
     until(lambda: "Continuing after" in hosts[0].log.read_text(), 150, hosts)
     before = iteration(tmp_path / "hosts")
@@ -251,15 +245,20 @@ def test_torchrun_restarts_from_the_last_checkpoint(hosts, tmp_path, monkeypatch
 def test_a_host_that_comes_back_goes_on(hosts, tmp_path, monkeypatch):
     """torchrun of the first one starts its processes again, and waits; the second one is started with --resume."""
     monkeypatch.setenv("TORCH_DISABLE_SHARE_RDZV_TCP_STORE", "1")
-    for host in hosts:
-        host.start(tmp_path / "hosts", ENDLESS, "--max-restarts", "1")
-    until(lambda: iteration(tmp_path / "hosts") > 0, 150, hosts)
+    begin(hosts, tmp_path / "hosts", "--max-restarts", "1")
     signaled("host", signal.SIGKILL)(hosts)
     hosts[1].agent.wait(10)
     hosts[1].start(tmp_path / "hosts", f"--resume {tmp_path / 'hosts'}", "--max-restarts", "1")
     until(lambda: "Continuing after" in hosts[0].log.read_text(), 150, hosts)
     before = iteration(tmp_path / "hosts")
     until(lambda: iteration(tmp_path / "hosts") > before, 150, hosts)
+
+
+def begin(hosts, folder, *torchrun):
+    """Start an endless training on all, and wait for its first checkpoint after some steps."""
+    for host in hosts:
+        host.start(folder, ENDLESS, *torchrun)
+    until(lambda: iteration(folder) > 0, 150, hosts)
 
 
 def iteration(folder):
