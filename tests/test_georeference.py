@@ -372,5 +372,4 @@ def test_damaged_coordinates_get_one_sentence(tmp_path):
     write_coordinates(tmp_path, None)
     assert read_coordinates(tmp_path) is None
     (tmp_path / "coordinates.json").mkdir()
-    with pytest.raises(InputError, match=r"coordinates\.json"):
-        read_coordinates(tmp_path)
+    refusal(lambda: read_coordinates(tmp_path), match=r"coordinates\.json")
