@@ -21,7 +21,7 @@ from warp_splat.export_html.command import export_html
 from warp_splat.formats import model_folder
 from warp_splat.formats.exchange import save_gaussians
 from warp_splat.formats.png import load_png
-from warp_splat.formats.splats import SplatArrays, SplatFile, sizes
+from warp_splat.formats.splats import SplatArrays, SplatFile, concatenated, sizes
 from warp_splat.formats.stored import logit, sigmoid, unit_quats
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
@@ -74,12 +74,12 @@ def split(splats: SplatArrays, rows: np.ndarray) -> SplatArrays:
     every, axis = np.arange(len(rows)), splats.scales[rows].argmax(axis=1)
     turns = Rotation.from_quat(unit_quats(splats.quats[rows]), scalar_first=True).as_matrix()
     offsets = 0.7 * turns[every, :, axis] * np.exp(splats.scales[rows, axis])[:, None]
-    child = SplatArrays(*(array[rows] for array in splats))
+    child = splats.take(rows)
     child.scales[every, axis] += np.log(0.714)
     child = child._replace(opacities=logit(1 - np.sqrt(1 - sigmoid(child.opacities.astype(np.float64)))))
     halves = [child._replace(means=(child.means + sign * offsets).astype(np.float32)) for sign in (1, -1)]
     kept = SplatArrays(*(np.delete(array, rows, axis=0) for array in splats))
-    return SplatArrays(*(np.concatenate(arrays) for arrays in zip(kept, *halves, strict=True)))
+    return concatenated([kept, *halves])
 
 
 def make_models(model: Path, folder: Path) -> dict[str, Path]:

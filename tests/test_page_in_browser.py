@@ -214,8 +214,7 @@ def test_names_of_strangers_are_text_in_a_browser(browser, tmp_path):
 
 
 def test_an_empty_model_and_a_file_without_cameras(browser, tmp_path):
-    nothing = SplatArrays(*(array[:0] for array in some_splats(1)))
-    save_gaussians(tmp_path / "nothing.ply", SplatFile(nothing))
+    save_gaussians(tmp_path / "nothing.ply", SplatFile(some_splats(0)))
     save_gaussians(tmp_path / "some.ply", SplatFile(some_splats(400, 1)))
     for name, message in (("nothing", "This model holds no Gaussians."), ("some", "")):
         assert main(["export-html", str(tmp_path / f"{name}.ply"), str(tmp_path / f"{name}.html")]) == 0

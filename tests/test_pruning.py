@@ -17,7 +17,7 @@ from warp_splat.config import RasterOptions
 from warp_splat.formats.coordinates import write_coordinates
 from warp_splat.formats.exchange import load_gaussians, save_gaussians
 from warp_splat.formats.model_folder import ply_path, write_cfg_args
-from warp_splat.formats.splats import SplatArrays, SplatFile
+from warp_splat.formats.splats import SplatArrays, SplatFile, concatenated
 from warp_splat.gaussians import GaussianModel
 from warp_splat.pruning.clean import floaters
 from warp_splat.pruning.opened import Opened
@@ -137,7 +137,7 @@ def test_what_is_hidden_goes_first():
     wall.means[:] = np.float32([[0, 0, 5], [0, 0, 5.1]]) @ camera.rotation + camera.center
     wall.scales[:], wall.opacities[:] = [2.0, 2.0, -4.0], 12.0
     wall.quats[:] = Rotation.from_matrix(camera.rotation.T).as_quat()[[3, 0, 1, 2]]
-    splats = SplatArrays(*(np.concatenate(arrays) for arrays in zip(front, back, wall, strict=True)))
+    splats = concatenated([front, back, wall])
     thinning = Thinning(splats, setting_of([camera]))
     kept = thinning.to(32)
     np.testing.assert_array_equal(kept.means, np.concatenate([front.means, wall.means]))
@@ -186,7 +186,7 @@ def test_floaters_hang_before_few_cameras():
     floater = splats_before(first, 1)
     floater.means[:] = np.float32([[0, 0, 0.4]]) @ cameras[2].rotation + cameras[2].center
     floater.scales[:] = -5.0
-    both = SplatArrays(*(np.concatenate(arrays) for arrays in zip(splats, floater, strict=True)))
+    both = concatenated([splats, floater])
     found = floaters(both, setting_of(cameras), 3.0, 0.5)
     assert np.flatnonzero(found).tolist() == [60]
     assert not floaters(both, setting_of(cameras), 3.0, 0.01).any()  # not near enough
@@ -326,7 +326,7 @@ def test_clean_reports_before_and_after(folder, tmp_path, capsys):
     """With a dark Gaussian planted right before the first training camera."""
     folder, splats = folder
     camera = load_scene(embedded_scene(), resolution=8, eval=True, report=lambda line: None).train[0].camera
-    planted = SplatArrays(*(np.concatenate([array, array[:1]]) for array in splats))
+    planted = concatenated([splats, splats.take(slice(1))])
     planted.means[-1] = np.float32([0, 0, 0.3]) @ camera.rotation + camera.center
     planted.sh[-1, 0], planted.scales[-1], planted.opacities[-1] = -0.5 / C0, -2.5, 5.0
     output = tmp_path / "b.spz"

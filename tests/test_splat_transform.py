@@ -17,7 +17,7 @@ from scipy.spatial import KDTree
 from splat_files import covariances, glb_attributes, some_file
 
 from warp_splat.formats.exchange import load_gaussians, save_gaussians
-from warp_splat.formats.splats import SplatArrays, SplatFile
+from warp_splat.formats.splats import SplatFile
 from warp_splat.formats.stored import sigmoid
 
 COMMAND = shlex.split(os.environ.get("WARP_SPLAT_TRANSFORM", "")) or [shutil.which("splat-transform") or ""]
@@ -81,7 +81,7 @@ def test_we_read_the_compressed_ply_that_it_writes(tmp_path, file):
     transform(tmp_path / "ours.ply", tmp_path / "theirs.compressed.ply")
     theirs, antialiased, *_ = load_gaussians(tmp_path / "theirs.compressed.ply")
     order = KDTree(theirs.means).query(file.splats.means)[1]  # it has an order of its own
-    theirs = SplatArrays(*(array[order] for array in theirs))
+    theirs = theirs.take(order)
     ranges = np.ptp(file.splats.means, axis=0).max()  # of a chunk, at most
     assert_same(theirs, file.splats, (0.5 * ranges / 1023, 0.5 * 7 / 1023, 0.5 / 255, 0.01, 0.5 / 32), shape=0.1)
     assert antialiased
@@ -97,7 +97,7 @@ def test_sog_both_ways(tmp_path):
     theirs, antialiased, *_ = load_gaussians(tmp_path / "back.ply")
     ours = load_gaussians(tmp_path / "ours.sog").splats
     inside = np.abs(ours.opacities) < 13  # it moves opacities of 0 and 1 by a millionth
-    assert_same(*(SplatArrays(*(array[inside] for array in splats)) for splats in (theirs, ours)))
+    assert_same(theirs.take(inside), ours.take(inside))
     assert antialiased and inside.mean() > 0.98
     save_gaussians(tmp_path / "ours.ply", SplatFile(written, True))
     transform(tmp_path / "ours.ply", tmp_path / "theirs.sog", "-g", "cpu")
@@ -105,8 +105,7 @@ def test_sog_both_ways(tmp_path):
     order = KDTree(theirs.means).query(written.means)[1]  # it has an order of its own
     assert sorted(order) == list(range(2000)) and antialiased
     rows = np.flatnonzero(sigmoid(written.opacities) > 1 / 255)  # its images lose the colors of those it writes as 0
-    theirs = SplatArrays(*(array[order[rows]] for array in theirs))
-    written = SplatArrays(*(array[rows] for array in written))
+    theirs, written = theirs.take(order[rows]), written.take(rows)
     # steps of its own: numbers are cut instead of rounded, codebooks have few entries in the tails
     assert_same(theirs, written, (2e-3, 0.1, 1 / 255, 0.05, 0.2), shape=0.3)
     assert np.abs(theirs.sh[:, 1:] - written.sh[:, 1:]).mean() < 0.02
