@@ -1,4 +1,4 @@
-"""How the CPU lists the splats of each tile: by spans, a radix sort and a counting sort, both in bands.
+"""How the CPU lists the splats of each tile: by spans and a counting sort in bands.
 
 Splats keep the order in which they are stored: most is then read and written from one end to the other, and what lies
 near each other in space does so in the caches. Spans are written by depth. So a counting sort by tile, which keeps
@@ -32,7 +32,6 @@ from warp_splat.kernels.tiles import MARGIN, cut, make_shaped, outline, packed, 
 
 wp.set_module_options(FORWARD_ONLY)
 
-DIGITS = 2**11  # of the radix sort
 AHEAD = wp.constant(32)  # rounds for which memory is asked before
 
 
@@ -140,50 +139,6 @@ def find_spans(
     for lane in range(LANES):
         if group + lane <= last:
             instances_out[group + lane] = wp.int64(found[lane])
-
-
-@wp.func
-def digit_of(key: int, shift: int):
-    """A digit of a number in float32, whose bits these are, such that digits are ordered as the numbers are."""
-    flipped = key ^ ((key >> 31) | wp.int32(-2147483648))
-    return (flipped >> shift) & (DIGITS - 1)
-
-
-@wp.kernel
-def count_digits(
-    first: int,  # band of this slice
-    bounds: wp.array[int],  # [B + 1] of the bands in `keys`
-    keys: wp.array[int],  # [V] bits of depths
-    shift: int,
-    # out
-    counts_out: wp.array2d[int],  # [B, DIGITS]
-):
-    band = first + wp.tid()
-    for i in range(bounds[band], bounds[band + 1]):
-        digit = digit_of(keys[i], shift)
-        counts_out[band, digit] = counts_out[band, digit] + 1
-
-
-@wp.kernel
-def sort_digits(
-    first: int,
-    bounds: wp.array[int],  # [B + 1]
-    keys: wp.array[int],  # [V]
-    values: wp.array[int],  # [V]
-    shift: int,
-    # out
-    cursor_out: wp.array2d[int],  # [B, DIGITS] where a band's next key with that digit goes
-    keys_out: wp.array[int],  # [V]
-    values_out: wp.array[int],  # [V]
-):
-    band = first + wp.tid()
-    for i in range(bounds[band], bounds[band + 1]):
-        key = keys[i]
-        digit = digit_of(key, shift)
-        place = cursor_out[band, digit]
-        keys_out[place] = key
-        values_out[place] = values[i]
-        cursor_out[band, digit] = place + 1
 
 
 @wp.kernel
