@@ -29,7 +29,7 @@ from warp_splat.inspect.verdicts import check_coordinates
 from warp_splat.rendering.camera_paths import focus_point
 from warp_splat.scene import load_scene
 from warp_splat.scene.embedded import embedded_scene
-from warp_splat.sfm.georeference import _gps, georeference, require_named
+from warp_splat.sfm.georeference import UP, _gps, fit, georeference, require_named
 
 UTM = np.array([691_000.25, 5_335_000.5, 520.0])
 COUNT = 16
@@ -132,6 +132,25 @@ def test_a_camera_that_strays_is_left_out(tmp_path):
     centers[0] += (1000, 0, 0)
     found = georeference(model_of(centers, random), tmp_path, source, 0, print)
     assert found["left_out"][0] == "0.jpg" and len(found["left_out"]) < 4
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_cameras_may_stray_where_most_stand_in_one_place(seed):
+    random = np.random.default_rng(seed)
+    world = random.uniform(-1, 1, (30, 3)) * np.where(np.arange(30) < 22, 0.5, 30)[:, None] * (1, 1, 0.2)
+    centers = world.copy()
+    centers[:4] += 90 * random.normal(size=(4, 3))
+    fitted, _, right, _ = fit(0.05 * centers, world + 0.2 * random.normal(size=world.shape), UP, 0)
+    assert not right[:4].any() and np.linalg.norm(fitted * (0.05 * world) - world, axis=1).max() < 1.5
+
+
+def test_exact_positions_stay_beside_wrong_ones():
+    """Along a spiral that becomes ever narrower."""
+    random, t = np.random.default_rng(12), np.linspace(-1, 0, 100)
+    world = 100 * np.exp(6 * t)[:, None] * np.stack([np.cos(12 * t), np.sin(12 * t), 0.1 + 0 * t], 1)
+    wrong = np.isin(np.arange(100), random.choice(100, 20, replace=False))
+    positions = world + np.where(wrong, 2, 0)[:, None] * random.normal(size=(100, 3))
+    assert fit(0.05 * world, positions, UP, 0)[2][~wrong].all()
 
 
 @pytest.mark.parametrize("looks", ["level", "down"])

@@ -120,8 +120,9 @@ def fit(
     off = [np.linalg.norm(each - np.median(each, axis=0), axis=1) for each in (centers, world)]
     sizes = [np.median(each) or each.mean() for each in off]
     nudged, to = centers + sizes[0] * nudges[0], world + sizes[1] * nudges[1]
-    unit = np.quantile(off[1], 2 / 3) / (np.quantile(off[0], 2 / 3) or off[0].max() or 1.0)
-    # what strays in one of them does not count
+    far = np.minimum(*(each / (size or 1.0) for each, size in zip(off, sizes, strict=True)))
+    far = far >= np.quantile(far, 2 / 3)  # in both: what strays in one of them does not count
+    unit = np.median(off[1][far] / np.maximum(off[0][far], 1e-9 * (off[0].max() or 1.0)))
     options = pycolmap.RANSACOptions(max_error=LOOSE * np.minimum(unit * off[0], off[1]).max() or 1.0, random_seed=seed)
     found = pycolmap.estimate_sim3d_robust(nudged, to, options)
     right = np.asarray(found["inlier_mask"]) if isinstance(found, dict) else np.ones(len(world), bool)
@@ -129,7 +130,7 @@ def fit(
     for _ in range(3):  # again, with the spread of those that fit
         fitted = pycolmap.estimate_sim3d(nudged[right], to[right]) or fitted
         residuals = np.linalg.norm(fitted * centers - world, axis=1)
-        right = residuals <= OUTLIER * 1.4826 * np.median(residuals[right]) + 1e-9 * _extent(world)
+        right = residuals <= OUTLIER * 1.4826 * np.median(residuals[right]) + 10 * NUDGE * _extent(world[right])
     middle = centers[right].mean(0)
     _, spans, (along, *_) = np.linalg.svd(centers[right] - middle)
     unsure = (np.median(residuals[right]) + 10 * NUDGE * _extent(world[right])) * np.sqrt(right.sum()) / fitted.scale
