@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from warp_splat.cli import main
 from warp_splat.compare.scenes import make_camera
-from warp_splat.config import RasterOptions
+from warp_splat.config import FinishedModel, RasterOptions
 from warp_splat.formats.coordinates import write_coordinates
 from warp_splat.formats.exchange import load_gaussians, save_gaussians
 from warp_splat.formats.model_folder import ply_path, write_cfg_args
@@ -264,6 +264,25 @@ def test_only_what_a_crop_leaves_is_compared(folder, tmp_path, capsys):
     one = splats.means[0]
     assert main([*arguments[:-6], *map(str, (*(one - 1e-3), *(one + 1e-3)))]) == 1
     assert "cover pixels of photographs" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", [["simplify", "--max_loss", "0.3"], ["clean"]], ids=lambda words: words[0])
+def test_what_a_file_has_no_room_for_counts(folder, tmp_path, capsys, monkeypatch, command):
+    """What is said of a .splat is what is there, which has no harmonics."""
+    monkeypatch.setattr("warp_splat.pruning.simplify.LEVELS", (1.0,))
+    splats, output = folder[1], tmp_path / "a.splat"
+    sh = np.random.default_rng(0).normal(scale=0.2, size=splats.sh.shape).astype(np.float32)
+    sh[:, 0] = splats.sh[:, 0]
+    save_gaussians(ply_path(tmp_path, 7), SplatFile(splats._replace(sh=sh)))
+    write_cfg_args(tmp_path, {"source_path": str(embedded_scene()), "resolution": 8, "eval": True})
+    assert main([*command, str(tmp_path), "-o", str(output), "--device", "cpu"]) == 0
+    out = capsys.readouterr().out
+    assert "lost: " in out and "all harmonics, for which such a file has no room" in out
+    opened = Opened(FinishedModel(model=str(tmp_path), device="cpu"))
+    before, after = (opened.psnr(load_gaussians(p).splats, opened.scene.train) for p in (ply_path(tmp_path, 7), output))
+    told = re.search(r"train PSNR (\S+) -> (\S+) dB", out)
+    assert abs(before - after) > 0.02
+    assert (float(told[1]), float(told[2])) == pytest.approx((before, after), abs=0.01)
 
 
 @pytest.mark.long

@@ -24,6 +24,7 @@ class Format(NamedTuple):
     marks: tuple[str, ...]  # those of MARKS that it has room for
     along_curve: bool = False  # written in an order in which near Gaussians follow each other
     empty: bool = True  # can say that there are no Gaussians
+    harmonics: bool = True  # beyond degree 0
 
 
 #: What a file may say of all its Gaussians, and how to say that it is lost.
@@ -36,7 +37,7 @@ BOTH = ("antialiased", "coordinates")
 FORMATS = {
     ".ply": Format(load_ply, save_ply, BOTH),
     ".compressed.ply": Format(load_ply, save_compressed_ply, BOTH, along_curve=True),
-    ".splat": Format(load_splat, save_splat, (), empty=False),
+    ".splat": Format(load_splat, save_splat, (), empty=False, harmonics=False),
     ".spz": Format(load_spz, save_spz, BOTH[:1]),
     ".sog": Format(load_sog, save_sog, BOTH[:1], along_curve=True, empty=False),
     **dict.fromkeys((".glb", ".gltf"), Format(load_gltf, save_gltf, tuple(MARKS), empty=False)),

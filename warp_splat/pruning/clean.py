@@ -18,7 +18,7 @@ from warp_splat.errors import InputError
 from warp_splat.evaluation.metrics import psnr
 from warp_splat.evaluation.report import contact_sheet
 from warp_splat.formats.splats import SplatArrays
-from warp_splat.pruning.opened import Opened, output_of, write
+from warp_splat.pruning.opened import Opened, held, output_of, write
 from warp_splat.pruning.score import ViewSetting, weights
 from warp_splat.pruning.thinning import model_of, tuned
 
@@ -33,14 +33,14 @@ def clean(config: CleanConfig) -> int:
     """
     output = output_of(config, "cleaned.ply")
     opened = Opened(config)
-    file, before = opened.file, opened.file.splats
+    before = opened.file.splats
     if (found := floaters(before, opened.setting, config.views, config.near)).all():
         raise InputError(f"{config.model}: nothing would be left; choose lower --views or --near.")
-    splats = before.take(np.flatnonzero(~found))
+    left = held(output, opened.file._replace(splats=before.take(np.flatnonzero(~found))))
+    splats = left.splats
     if config.steps:
         parts = {*str(opened.trained.get("parts", "")).split(","), "floaters"}
         trained = {**opened.trained, "parts": ",".join(sorted(parts))}
-        left = file._replace(splats=splats)
         splats = tuned(opened.scene, left, opened.setting, len(splats.means), config.steps, trained)
     code = write(output, opened, splats)
     opened.print_quality(before, splats)

@@ -115,6 +115,12 @@ def output_of(config: SimplifyConfig | CleanConfig, name: str) -> Path:
     return path
 
 
+def held(path: Path, file: SplatFile) -> SplatFile:
+    """The Gaussians without harmonics, if files of this name have no room for them."""
+    sh = file.splats.sh if format_of(path).harmonics else file.splats.sh[:, :1]
+    return file._replace(splats=file.splats._replace(sh=sh))
+
+
 def written_bytes(name: Path, file: SplatFile) -> int:
     """Of a file of this name, written elsewhere and removed."""
     with tempfile.TemporaryDirectory() as folder:
@@ -129,6 +135,8 @@ def write(path: Path, finished: Finished, splats: SplatArrays) -> int:
     saved = save_somewhere(path, lambda place: save_gaussians(place, after, notes.append))
     with suppress(InputError, OSError):  # of the folder for temporary files
         size = f", {written_bytes(path, after) / 1e6:.2f} of {written_bytes(path, before) / 1e6:.2f} MB"
+    if splats.sh.shape[1] < before.splats.sh.shape[1]:
+        notes.append("all harmonics, for which such a file has no room")
     print(f"{saved}: {len(splats.means)} of {len(before.splats.means)} Gaussians{size}")
     if notes:
         print(f"  lost: {'; '.join(dict.fromkeys(notes))}")

@@ -17,7 +17,7 @@ from warp_splat.evaluation.report import BLUE, GREEN, ORANGE, new_panels, plain_
 from warp_splat.formats.files import write_csv
 from warp_splat.formats.model_folder import folder_of, is_file_of_gaussians, read_cfg_args
 from warp_splat.formats.splats import COEFFICIENTS, SplatArrays, SplatFile, sizes
-from warp_splat.pruning.opened import Opened, output_of, require_some, write, written_bytes
+from warp_splat.pruning.opened import Opened, held, output_of, require_some, write, written_bytes
 from warp_splat.pruning.score import costs
 from warp_splat.pruning.thinning import Thinning, model_of, tuned
 from warp_splat.rendering.changes import largest_change
@@ -46,7 +46,8 @@ def simplify(config: SimplifyConfig) -> int:
     opened = Opened(config)
     if config.tolerance and opened.harmonics is not None:
         raise InputError("--tolerance: expected one color behind the Gaussians, found a sky; choose with --max_loss.")
-    thinning, file = Thinning(opened.file.splats, opened.setting), opened.file
+    whole, file = opened.file.splats, held(output, opened.file)
+    thinning = Thinning(file.splats, opened.setting)
     _curve(opened, thinning, output)
 
     def made(count: int) -> SplatArrays:
@@ -55,17 +56,18 @@ def simplify(config: SimplifyConfig) -> int:
         return tuned(opened.scene, file, opened.setting, count, config.steps, opened.trained)
 
     total, views = len(file.splats.means), opened.scene.train
-    before = opened.psnr(file.splats, views) if config.max_loss else math.inf
+    before = opened.psnr(whole, views) if config.max_loss else math.inf
 
     def changed(splats: SplatArrays) -> tuple[float, float]:
-        before, after = (model_of(some, opened.setting).activated() for some in (file.splats, splats))
+        before, after = (model_of(some, opened.setting).activated() for some in (whole, splats))
         cameras = [view.camera for view in views]
         return largest_change(before, after, cameras, opened.setting.background, opened.setting.options)
 
     if config.tolerance:
         _, count = _narrowed(0, total, lambda count: changed(made(count))[1] > config.tolerance)
     elif config.max_loss:
-        enough = before - max(config.max_loss - HARMONICS_LOSS, 0.0)
+        spare = min(HARMONICS_LOSS, config.max_loss / 2) if file.splats.sh.shape[1] > 1 else 0.0
+        enough = before - config.max_loss + spare
         _, count = _narrowed(0, total, lambda count: opened.psnr(made(count), views) < enough)
     else:
         count = _count(config, output, file, thinning.to)
@@ -84,7 +86,7 @@ def simplify(config: SimplifyConfig) -> int:
             print("  Without any change, the bound of rounding is more: nothing is left out; raise --tolerance.")
     numbers = np.bincount(degrees_of(splats))
     print(f"  harmonics: {', '.join(f'{number} of degree {degree}' for degree, number in enumerate(numbers))}")
-    opened.print_quality(file.splats, splats)
+    opened.print_quality(whole, splats)
     print(f"  what each share costs: {output.with_suffix('.curve.png')}, .csv")
     return code
 
@@ -211,7 +213,7 @@ def _unseen(config: SimplifyConfig, output: Path) -> int:
     print(UNSEEN)
     finished = Finished(config.model, config.iteration, config.crop)
     require_some(finished)
-    file = finished.file
+    file = held(output, finished.file)
     order = np.argsort(-sizes(file.splats), kind="stable")
     keep = lambda count: file.splats.take(np.sort(order[:count]))  # noqa: E731
     count = _count(config, output, file, keep)
