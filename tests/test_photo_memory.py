@@ -10,6 +10,7 @@ from commands import train
 from scene_files import texture, write_colmap, write_image
 from trainings import begin, check_same, resumed, stepped, steps
 
+from warp_splat.cli import main
 from warp_splat.errors import InputError
 from warp_splat.evaluation.metrics import METRICS
 from warp_splat.evaluation.views import evaluate_views, show_views
@@ -139,3 +140,15 @@ def test_a_photograph_that_breaks_off_ends_a_training_that_is_kept(tmp_path, cap
     said = capsys.readouterr()
     assert "3.jpg: expected a complete image file" in said.err and "Model after" in said.out
     assert ply_path(tmp_path / "model", int(said.out.split("Model after ")[1].split()[0])).is_file()
+
+
+def test_a_held_out_photograph_that_breaks_off_loses_no_step(tmp_path, capsys):
+    root = write_colmap(tmp_path / "scene", [f"{index}.jpg" for index in range(6)])
+    broken, model = root / "images" / "0.jpg", tmp_path / "model"
+    whole = broken.read_bytes()
+    broken.write_bytes(whole[:-900])
+    options = ["-s", str(root), "--photo_memory", "1e-6", "--iterations", "12", "--test_iterations", "5"]
+    assert train(model, *options) == 1 and "continue after iteration 5" in capsys.readouterr().out
+    broken.write_bytes(whole)
+    assert main(["train", "--resume", str(model)]) == 0 == train(tmp_path / "again", *options)
+    assert ply_path(model, 12).read_bytes() == ply_path(tmp_path / "again", 12).read_bytes()

@@ -191,12 +191,16 @@ def _finish(trainer: Trainer, run: Run, viewer: TrainingViewer | None, say: Repo
     run.gaussians = trainer.processes.total(len(trainer.model))
     # as in the file: at one depth, the first is in front
     trainer.optimizer.arrange(trainer.model.arranging(trainer.processes, [len(trainer.model)]))
-    trainer.lead(lambda: finish(trainer, run, say))
+    elsewhere = run.saved and run.saved != model_folder.ply_path(run.folder, run.iteration)
+    try:
+        trainer.lead(lambda: finish(trainer, run, say))
+    finally:  # the disk may be full for the pictures, too
+        if elsewhere:
+            text = f"The model is not in {run.folder}, but in {run.saved.parent}; see the warning, and move this."
+            tqdm.write(text, file=sys.stderr)
     if watched and run.iteration >= end:
         trainer.lead(lambda: viewer and viewer.linger())
-    if run.saved and run.saved != model_folder.ply_path(run.folder, run.iteration):
-        elsewhere = f"The model is not in {run.folder}, but in {run.saved.parent}; see the warning, and move this."
-        tqdm.write(elsewhere, file=sys.stderr)
+    if elsewhere:
         return 1
     if run.iteration < end:
         return 130

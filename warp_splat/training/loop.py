@@ -76,7 +76,12 @@ def _do_what_is_due(trainer: Trainer, run: Run, interrupted: list[int], bar: tqd
     check = whole or processes.reaches(run.iteration, some)
     named = processes.reaches(run.iteration, report.checkpoint_iterations)
     if check:
-        _check(trainer, run, bar, whole)
+        try:
+            _check(trainer, run, bar, whole)
+        except InputError:  # a photograph has gone, but the model is whole
+            if processes.count == 1:
+                keep(trainer, run, named)
+            raise
     if stop or wish == KEEP or named:
         keep(trainer, run, named)
     if stop and not check:  # after the checkpoint: a run that goes on from there never had this record
