@@ -330,6 +330,9 @@ def test_files_and_checkpoints(scene, tmp_path, fails):
     resume = ["train", "--resume", str(tmp_path)]
     assert parse(resume).learn.end == parse([*resume, "--minutes", "4"]).learn.end == np.inf
     assert parse([*resume, "--iterations", "70"]).learn.end == 70
+    run.spent = 180.0
+    keep(trainer, run)
+    assert "--minutes 3: expected more than the 3.00 that" in fails(*resume, "--minutes", "3")
     trainer.settle(20, 5)
     keep(trainer, run)
     assert parse(resume).learn.end == 25

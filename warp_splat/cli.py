@@ -153,7 +153,8 @@ def _restarted(given: dict) -> dict:
 
 def _continued(given: dict) -> dict:
     """Options of the checkpoint to start from, but for those that are given."""
-    from warp_splat.training.config_file import load_options  # noqa: PLC0415 - NumPy takes its time to load
+    from warp_splat.formats.checkpoint import load_header  # noqa: PLC0415 - NumPy takes its time to load
+    from warp_splat.training.config_file import load_options  # noqa: PLC0415 - as that does
 
     source = given["start_checkpoint"]
     options = load_options(source)
@@ -166,6 +167,8 @@ def _continued(given: dict) -> dict:
             f"--minutes: expected a training that began with it and does not end yet, found {source}; name a later end "
             "with --iterations."
         )
+    if (minutes := given.get("minutes")) and (spent := load_header(source).fact("spent", float)) >= 60 * minutes:
+        raise InputError(f"--minutes {minutes:g}: expected more than the {spent / 60:.2f} that {source} has taken.")
     return _over(options, given)
 
 
