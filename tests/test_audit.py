@@ -204,14 +204,18 @@ def test_this_renderer_is_as_float64(importable):
 
 @pytest.mark.slow
 def test_a_program_is_audited_and_its_finding_made_small(tmp_path):
-    """It draws black whatever it is asked."""
+    """It draws black whatever it is asked, but for very few Gaussians; then nothing, of which nothing old is shown."""
     program = tmp_path / "program.py"
-    program.write_text("import sys\nfrom PIL import Image\nImage.new('RGB', (64, 48)).save(sys.argv[3])\n")
+    black = "import os, sys\nfrom PIL import Image\nassert os.path.getsize(sys.argv[1]) > 1300\n"
+    program.write_text(f"{black}Image.new('RGB', (64, 48)).save(sys.argv[3])\n")
     command = f"{sys.executable} {program} {{ply}} {{cameras}} {{out}}"
     assert main(["audit", "black", "--command", command, "--case", "cloud", "--out", str(tmp_path / "out")]) == 1
     assert len(load_ply(tmp_path / "out" / "scene.ply").splats.means) < len(SCENES["cloud"][1]()[0]["means"]) / 4
     assert len(json.loads((tmp_path / "out" / "cameras.json").read_text())) == 1
     assert not load_png(tmp_path / "out" / "found.png").any() and load_png(tmp_path / "out" / "expected.png").any()
+    program.write_text("1 / 0")
+    assert main(["audit", "black", "--command", command, "--case", "cloud", "--out", str(tmp_path / "out")]) == 1
+    assert not list(tmp_path.glob("out/found.*"))
 
 
 @pytest.mark.slow

@@ -118,6 +118,8 @@ def _write_case(renderer: Renderer, degree: int, name: str, out: Path) -> int:
     save_png(out / "expected.png", (in_eight_bits(expected) * 255).astype(np.uint8))
     count = f"{name}: {(many := len(workload.gaussians.means))} Gaussian{'s' * (many > 1)} on {background}"
     if answer is None:
+        for old in ("found.npy", "found.png"):  # of another scene
+            (out / old).unlink(missing_ok=True)
         return 1
     write_array(out / "found.npy", answer.image)
     save_png(out / "found.png", (in_eight_bits(np.nan_to_num(answer.image)) * 255).astype(np.uint8))

@@ -3,6 +3,7 @@
 import functools
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -128,12 +129,13 @@ def smallest(renderer: Renderer, workload: Workload) -> tuple[Workload, Answer]:
     rows = np.arange(len(workload.gaussians.means))
     most, part, answer = error_of(rows)
     size = len(rows) // 2
-    while size:
-        for start in range(0, len(rows), size):
-            fewer = np.delete(rows, np.arange(start, min(start + size, len(rows))))
-            if len(fewer) and (found := error_of(fewer))[0] >= 0.5 * most and most > 0:
-                rows, (_, part, answer) = fewer, found
-                break
-        else:
-            size //= 2
+    with suppress(RendererFailed):  # what was drawn until then shows the fault
+        while size:
+            for start in range(0, len(rows), size):
+                fewer = np.delete(rows, np.arange(start, min(start + size, len(rows))))
+                if len(fewer) and (found := error_of(fewer))[0] >= 0.5 * most and most > 0:
+                    rows, (_, part, answer) = fewer, found
+                    break
+            else:
+                size //= 2
     return part, answer
