@@ -169,7 +169,7 @@ def check_axes(subject: Subject) -> Iterator[Finding]:
     if seen[best] > BETTER * seen["as stored"]:
         yield Finding("axes", "error", f"with {best} the images show more points ({shares}); the axes are mixed up.")
     else:
-        yield Finding("axes", "ok", f"the poses show as many points as in no other convention ({shares}).")
+        yield Finding("axes", "ok", f"no other convention would show many more points ({shares}).")
 
 
 def _inverted(camera: Camera) -> Camera:

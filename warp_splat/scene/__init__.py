@@ -104,7 +104,7 @@ def load_scene(
     for told in filter(None, (too_far(train), "" if drawn else too_near(train, points))):
         report(f"Warning: {told}")
     views, bound = load_views(train + test, resolution, white_background, invert_masks, memory)
-    halves = (train, views[: len(train)]), (test, views[len(train) :])
+    halves = (train, views[: len(train)], ""), (test, views[len(train) :], " (those held out)")
     train_views, test_views = (_drop_masked(*half, invert_masks, source, report) for half in halves)
     if views[0].linear and not start:
         colors = np.rint(255 * from_srgb(colors / 255, np.where)).astype(np.uint8)
@@ -114,7 +114,7 @@ def load_scene(
 
 
 def _drop_masked(
-    photos: list[Photo], views: list[View], invert_masks: bool, source: str | Path, report: Report
+    photos: list[Photo], views: list[View], kind: str, invert_masks: bool, source: str | Path, report: Report
 ) -> list[View]:
     """The views with a pixel that counts; only masks are read."""
     from warp_splat.scene.images import THREADS, has_counts  # noqa: PLC0415  keeps `import warp_splat` light
@@ -122,18 +122,18 @@ def _drop_masked(
     with ThreadPoolExecutor(THREADS) as pool:
         shown = pool.map(lambda photo, view: has_counts(photo, view.camera, invert_masks), photos, views)
         kept = list(compress(views, shown))
-    require_unmasked(len(views), len(views) - len(kept), source)
+    require_unmasked(len(views), len(views) - len(kept), source, kind)
     if len(kept) < len(views):
         report(f"Leaving out {len(views) - len(kept)} of {len(views)} images that their masks cover.")
     return kept
 
 
-def require_unmasked(count: int, black: int, source: str | Path) -> None:
-    """Refuse ``count`` photographs if as many have black masks."""
+def require_unmasked(count: int, black: int, source: str | Path, kind: str = "") -> None:
+    """Refuse ``count`` photographs, of a ``kind``, if as many have black masks."""
     if 0 < count == black:
         raise InputError(
-            f"{source}: expected masks that leave something to train on or test with, but those of all {count} images "
-            "are black; use --invert_masks, or remove the folder masks."
+            f"{source}: expected masks that leave something to train on, and to test with, but those of all {count} "
+            f"images{kind} are black; use --invert_masks, change the masks{', or leave out --eval' * bool(kind)}."
         )
 
 
