@@ -18,7 +18,7 @@ from warp_splat.errors import InputError
 from warp_splat.evaluation.metrics import psnr
 from warp_splat.evaluation.report import contact_sheet
 from warp_splat.formats.splats import SplatArrays
-from warp_splat.pruning.opened import Opened, held, output_of, write
+from warp_splat.pruning.opened import Opened, as_held, output_of, write
 from warp_splat.pruning.score import ViewSetting, weights
 from warp_splat.pruning.thinning import model_of, tuned
 
@@ -36,7 +36,7 @@ def clean(config: CleanConfig) -> int:
     before = opened.file.splats
     if (found := floaters(before, opened.setting, config.views, config.near)).all():
         raise InputError(f"{config.model}: nothing would be left; choose lower --views or --near.")
-    left = held(output, opened.file._replace(splats=before.take(np.flatnonzero(~found))))
+    left = as_held(output, opened.file._replace(splats=before.take(np.flatnonzero(~found))))
     splats = left.splats
     if config.steps:
         parts = {*str(opened.trained.get("parts", "")).split(","), "floaters"}

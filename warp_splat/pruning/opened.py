@@ -115,7 +115,7 @@ def output_of(config: SimplifyConfig | CleanConfig, name: str) -> Path:
     return path
 
 
-def held(path: Path, file: SplatFile) -> SplatFile:
+def as_held(path: Path, file: SplatFile) -> SplatFile:
     """The Gaussians without harmonics, if files of this name have no room for them."""
     sh = file.splats.sh if format_of(path).harmonics else file.splats.sh[:, :1]
     return file._replace(splats=file.splats._replace(sh=sh))

@@ -17,7 +17,7 @@ from warp_splat.evaluation.report import BLUE, GREEN, ORANGE, new_panels, plain_
 from warp_splat.formats.files import write_csv
 from warp_splat.formats.model_folder import folder_of, is_file_of_gaussians, read_cfg_args
 from warp_splat.formats.splats import COEFFICIENTS, SplatArrays, SplatFile, sizes
-from warp_splat.pruning.opened import Opened, held, output_of, require_some, write, written_bytes
+from warp_splat.pruning.opened import Opened, as_held, output_of, require_some, write, written_bytes
 from warp_splat.pruning.score import costs
 from warp_splat.pruning.thinning import Thinning, model_of, tuned
 from warp_splat.rendering.changes import largest_change
@@ -46,7 +46,7 @@ def simplify(config: SimplifyConfig) -> int:
     opened = Opened(config)
     if config.tolerance and opened.harmonics is not None:
         raise InputError("--tolerance: expected one color behind the Gaussians, found a sky; choose with --max_loss.")
-    whole, file = opened.file.splats, held(output, opened.file)
+    whole, file = opened.file.splats, as_held(output, opened.file)
     thinning = Thinning(file.splats, opened.setting)
     _curve(opened, thinning, output)
 
@@ -213,7 +213,7 @@ def _unseen(config: SimplifyConfig, output: Path) -> int:
     print(UNSEEN)
     finished = Finished(config.model, config.iteration, config.crop)
     require_some(finished)
-    file = held(output, finished.file)
+    file = as_held(output, finished.file)
     order = np.argsort(-sizes(file.splats), kind="stable")
     keep = lambda count: file.splats.take(np.sort(order[:count]))  # noqa: E731
     count = _count(config, output, file, keep)
