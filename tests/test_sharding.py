@@ -27,12 +27,12 @@ from warp_splat.training.options import TrainConfig
 from warp_splat.training.trainer import Trainer
 
 SCHEDULE = (
-    "-r 8 --seed 0 --views 4 --densify_from_iter 10 --densification_interval 20 --opacity_reset_interval 60 "
+    "-r 8 --eval --seed 0 --views 4 --densify_from_iter 10 --densification_interval 20 --opacity_reset_interval 60 "
     "--sh_interval 30 --densify_grad_threshold 0.00005 --test_iterations"
 )
 GROWTHS = {
     "reference": "--prune_screen_size 40",
-    "mcmc": "--growth mcmc --max_gaussians 5500 --eval --optimizer_type sparse_adam",
+    "mcmc": "--growth mcmc --max_gaussians 5500 --optimizer_type sparse_adam",
     "budget": "--growth budget --max_gaussians 6000 --parts sky,exposure,depth,floaters --random_background",
 }
 

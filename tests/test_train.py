@@ -5,11 +5,12 @@ import json
 import re
 import signal
 import sys
+import time
 
 import numpy as np
 import pytest
 import torch
-from commands import FOX, SCENE, SHORT, no_space, python, started, train
+from commands import FOX, PATIENCE, SCENE, SHORT, no_space, python, started, train
 from splat_files import some_file
 
 from warp_splat.cli import main
@@ -142,10 +143,10 @@ def test_options(options, tmp_path):
 
 @pytest.mark.slow
 def test_ctrl_c_saves_the_model_and_says_how_to_continue(tmp_path, capsys):
-    process = started("train.py", "-s", SCENE, "-r", "8", "--eval", "-m", tmp_path, "--iterations", "100000")
-    for line in process.stderr:
-        if "it/s" in line:
-            break
+    steps = ["--iterations", "100000", "--test_iterations", "9"]
+    process, end = started("train.py", "-s", SCENE, "-r", "8", "--eval", "-m", tmp_path, *steps), time.time() + PATIENCE
+    while not (tmp_path / "preview.png").exists() and process.poll() is None and time.time() < end:
+        time.sleep(0.1)
     process.send_signal(signal.SIGINT)
     out, err = process.communicate(timeout=120)
     assert process.returncode == 130, err
