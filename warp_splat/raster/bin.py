@@ -238,7 +238,7 @@ def order_by_depth(depths: np.ndarray) -> np.ndarray:
     found = [np.empty(0, dtype=np.int32)] * parts
 
     def sort(part: int, _: int) -> None:
-        rows = np.flatnonzero((depths >= edges[part]) & ~(depths >= edges[part + 1])).astype(np.int32)
+        rows = np.flatnonzero((depths >= edges[part]) & ~(depths >= edges[part + 1]))
         keys, values = np.empty(2 * len(rows), dtype=np.float32), np.empty(2 * len(rows), dtype=np.int32)  # as it needs
         keys[: len(rows)], values[: len(rows)] = depths[rows], rows
         if len(rows):
