@@ -31,6 +31,10 @@ def find_kernels():
                 )
 
 
+FOUND = list(find_kernels())
+each_kernel = pytest.mark.parametrize(("lines", "kernel"), FOUND)
+
+
 def base_of(target):
     """The name of the variable that ``a[i, j]`` or ``a[i][j].x`` is part of."""
     while isinstance(target, ast.Subscript | ast.Attribute):
@@ -57,10 +61,10 @@ def comment(lines, parameter):
 
 
 def test_kernels_are_found():
-    assert len(list(find_kernels())) > 15
+    assert len(FOUND) > 15
 
 
-@pytest.mark.parametrize(("lines", "kernel"), list(find_kernels()))
+@each_kernel
 def test_what_is_written_is_named_so(lines, kernel):
     """And what is named so is used: written here, or given to a function that writes it."""
     changed = {name for name in written(kernel) if name in parameters(kernel)}
@@ -69,7 +73,7 @@ def test_what_is_written_is_named_so(lines, kernel):
     assert {name for name in parameters(kernel) if name.endswith("_out")} <= used
 
 
-@pytest.mark.parametrize(("lines", "kernel"), list(find_kernels()))
+@each_kernel
 def test_order_of_parameters(lines, kernel):
     """``first`` (of a slice; blocks have a tile or a group), inputs, a line ``# out``, outputs."""
     names = parameters(kernel)
@@ -82,7 +86,7 @@ def test_order_of_parameters(lines, kernel):
         assert lines[outputs[0].lineno - 2].strip().startswith("# out")
 
 
-@pytest.mark.parametrize(("lines", "kernel"), list(find_kernels()))
+@each_kernel
 def test_arrays_say_their_shape(lines, kernel):
     for parameter in kernel.args.args:
         if "wp.array" in ast.unparse(parameter.annotation):
@@ -99,7 +103,7 @@ def test_arrays_of_structs_say_their_shape():
                         assert comment(lines, field).strip().startswith("["), f"{struct.name}: {ast.unparse(field)}"
 
 
-@pytest.mark.parametrize(("lines", "kernel"), list(find_kernels()))
+@each_kernel
 def test_size(lines, kernel):
     assert len(kernel.args.args) <= MOST_PARAMETERS, "put what belongs together into a struct (kernels/structs.py)"
     assert kernel.end_lineno - kernel.lineno < MOST_LINES
