@@ -29,7 +29,7 @@ from warp_splat.inspect.verdicts import check_coordinates
 from warp_splat.rendering.camera_paths import focus_point
 from warp_splat.scene import load_scene
 from warp_splat.scene.embedded import embedded_scene
-from warp_splat.sfm.georeference import UP, _gps, fit, georeference, require_named
+from warp_splat.sfm.georeference import UP, _by_distances, _gps, fit, georeference, require_named
 
 UTM = np.array([691_000.25, 5_335_000.5, 520.0])
 COUNT = 16
@@ -185,6 +185,8 @@ def test_distances_give_the_scale_and_cameras_the_up_and_unknown_names_are_told(
     centers = random.uniform(-5, 5, (COUNT, 3))
     model = model_of(centers, random)
     between = np.linalg.norm(centers[0] - centers[1]), np.linalg.norm(centers[2] - centers[3])
+    rows, places = [(["0.jpg", "1.jpg"], [between[0]])], dict(zip(("0.jpg", "1.jpg"), centers, strict=False))
+    assert _by_distances(model_of(centers, random), places, np.zeros(3), rows, "a", str)["scale"] == pytest.approx(1)
     (tmp_path / "d.csv").write_text(
         f"name,other,distance\n0.jpg,1.jpg,{between[0]}\n2.jpg, 3.jpg, {between[1]}\nother.jpg,1.jpg,7\n"
     )

@@ -159,7 +159,7 @@ def _by_distances(model, centers: dict, up: np.ndarray, rows: list, source: str,
     if (miss := float(np.median(off / true))) > COARSE:
         raise InputError(f"{source}: expected distances that fit the cameras, found {miss:.0%} off (median); check it.")
     say(f"coordinates: {Path(source).name}, {len(off)} distances fit within {np.median(off):.2g} m (median)")
-    level = Rotation.align_vectors([UP], [up])[0].as_matrix()
+    level = Rotation.align_vectors([UP], [up if np.linalg.norm(up) > 1e-6 else UP])[0].as_matrix()  # or tops cancel
     _move(model, pycolmap.Sim3d(scale, pycolmap.Rotation3d(level), -scale * level @ places.mean(0)))
     residuals = {f"{a} to {b}": float(r) for (a, b, _), r in zip(known, off, strict=True)}
     return _described(np.zeros(3), Path(source).name, scale, residuals, [])
