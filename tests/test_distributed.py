@@ -1,4 +1,4 @@
-"""Two processes that torchrun starts: the same model in both, the step of their mean gradient, and how they end."""
+"""Two processes, started as torchrun does: the same model in both, the step of their mean gradient, how they end."""
 
 import json
 import math

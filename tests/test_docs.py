@@ -190,7 +190,7 @@ def run(line, folder):
     if program == "python":
         subprocess.run([sys.executable, ROOT / arguments[0], *arguments[1:]], check=True, capture_output=True)
         return
-    if program == "torchrun":  # test_distributed.py::test_a_whole_run_of_two_processes runs it
+    if program == "torchrun":  # test_distributed.py::test_ctrl_c_stops_all_after_the_same_step runs it
         assert arguments[:3] == ["--nproc-per-node", "2", "train.py"], line
         parse(["train", *arguments[3:]])
         return

@@ -1,4 +1,4 @@
-"""Run by torchrun from ``test_distributed.py``: three steps together, what each process got, then models that differ.
+"""By two processes of ``test_distributed.py``: three steps together, what each process got, then models that differ.
 
 torchrun --nproc-per-node 2 tests/torchrun_steps.py folder scene optimizer_type
 """
