@@ -18,6 +18,7 @@ POSITIONS, DISTANCES = ["name", "x", "y", "z"], ["name", "other", "distance"]  #
 LEAST = 3  # positions
 UP = np.array((0.0, 0.0, 1.0))  # in the world
 LOOSE = 0.05  # of the extent: what RANSAC takes for right
+NEAR = 4.0  # times the median distance from the middle: the extent, where some lie much farther out than most
 OUTLIER = 3.0  # standard deviations, as the median of the residuals tells them
 COARSE = 0.1  # of the extent: GPS that errs by more is not taken
 USUAL = 5.0  # units: half of what photographs show is farther away, where nothing tells the scale
@@ -72,10 +73,10 @@ def georeference(model: pycolmap.Reconstruction, database: Path, source: str, se
     world = np.array([known[name] for name in names])
     origin = np.round(np.median(world, axis=0))
     fitted, residuals, right, line = fit(np.array([centers[name] for name in names]), world - origin, up, seed)
-    extent = _extent(world[right])
     error = float(np.median(residuals[right])) if right.any() else np.inf
-    if right.sum() < max(LEAST, len(names) / 2) or error > COARSE * extent:
-        text = f"{right.sum()} of {len(names)} fit within {error:.2g} m, where they span {extent:.3g} m"
+    if not _most_fit(residuals, right, world):
+        span = _extent(world[right])
+        text = f"{right.sum()} of {len(names)} fit within {error:.2g} m, where they span {span:.3g} m"
         if source != "auto":
             raise InputError(f"{source}: expected positions that fit the cameras, but {text}; check names and axes.")
         say(f"no coordinates, since positions do not fit the cameras: {text}")
@@ -123,14 +124,18 @@ def fit(
     far = np.minimum(*(each / (size or 1.0) for each, size in zip(off, sizes, strict=True)))
     far = far >= np.quantile(far, 2 / 3)  # in both: what strays in one of them does not count
     unit = np.median(off[1][far] / np.maximum(off[0][far], 1e-9 * (off[0].max() or 1.0)))
-    options = pycolmap.RANSACOptions(max_error=LOOSE * np.minimum(unit * off[0], off[1]).max() or 1.0, random_seed=seed)
-    found = pycolmap.estimate_sim3d_robust(nudged, to, options)
-    right = np.asarray(found["inlier_mask"]) if isinstance(found, dict) else np.ones(len(world), bool)
-    fitted, residuals = pycolmap.Sim3d(), np.zeros(len(world))
-    for _ in range(3):  # again, with the spread of those that fit
-        fitted = pycolmap.estimate_sim3d(nudged[right], to[right]) or fitted
-        residuals = np.linalg.norm(fitted * centers - world, axis=1)
-        right = residuals <= OUTLIER * 1.4826 * np.median(residuals[right]) + 10 * NUDGE * _extent(world[right])
+    wide = LOOSE * np.minimum(unit * off[0], off[1]).max() or 1.0
+    for bound in (wide, min(wide, NEAR * LOOSE * sizes[1] or wide)):  # less, where most of them lie within the first
+        options = pycolmap.RANSACOptions(max_error=bound, random_seed=seed)
+        found = pycolmap.estimate_sim3d_robust(nudged, to, options)
+        right = np.asarray(found["inlier_mask"]) if isinstance(found, dict) else np.ones(len(world), bool)
+        fitted, residuals = pycolmap.Sim3d(), np.zeros(len(world))
+        for _ in range(3):  # again, with the spread of those that fit
+            fitted = pycolmap.estimate_sim3d(nudged[right], to[right]) or fitted
+            residuals = np.linalg.norm(fitted * centers - world, axis=1)
+            right = residuals <= OUTLIER * 1.4826 * np.median(residuals[right]) + 10 * NUDGE * _extent(world[right])
+        if _most_fit(residuals, right, world):
+            break
     middle = centers[right].mean(0)
     _, spans, (along, *_) = np.linalg.svd(centers[right] - middle)
     unsure = (np.median(residuals[right]) + 10 * NUDGE * _extent(world[right])) * np.sqrt(right.sum()) / fitted.scale
@@ -141,6 +146,12 @@ def fit(
         fitted = pycolmap.Sim3d(fitted.scale, turned, fitted * middle - fitted.scale * (turned * middle))
         residuals = np.linalg.norm(fitted * centers - world, axis=1)
     return fitted, residuals, right, line
+
+
+def _most_fit(residuals: np.ndarray, right: np.ndarray, world: np.ndarray) -> bool:
+    """Whether half of the positions were taken for right, and err little for where they lie."""
+    most = right.sum() >= max(LEAST, len(world) / 2)
+    return bool(most and np.median(residuals[right]) <= COARSE * _extent(world[right]))
 
 
 def _extent(points: np.ndarray) -> float:
