@@ -267,7 +267,7 @@ def test_only_what_a_crop_leaves_is_compared(folder, tmp_path, capsys):
 
 
 @pytest.mark.parametrize("command", [["simplify", "--max_loss", "0.3"], ["clean"]], ids=lambda words: words[0])
-def test_what_a_file_has_no_room_for_counts(folder, tmp_path, capsys, monkeypatch, command):
+def test_what_a_file_has_no_room_for_counts(folder, tmp_path, capsys, monkeypatch, fails, command):
     """What is said of a .splat is what is there, which has no harmonics."""
     monkeypatch.setattr("warp_splat.pruning.simplify.LEVELS", (1.0,))
     splats, output = folder[1], tmp_path / "a.splat"
@@ -283,6 +283,9 @@ def test_what_a_file_has_no_room_for_counts(folder, tmp_path, capsys, monkeypatc
     told = re.search(r"train PSNR (\S+) -> (\S+) dB", out)
     assert abs(before - after) > 0.02
     assert (float(told[1]), float(told[2])) == pytest.approx((before, after), abs=0.01)
+    for promise in ("--max_loss", "--tolerance"):
+        tried = ["simplify", tmp_path, promise, "0.001", "-o", output, "--device", "cpu"]
+        assert "no room for harmonics, which would cost more than is allowed" in fails(*tried)
 
 
 @pytest.mark.long

@@ -56,24 +56,26 @@ def simplify(config: SimplifyConfig) -> int:
         return tuned(opened.scene, file, opened.setting, count, config.steps, opened.trained)
 
     total, views = len(file.splats.means), opened.scene.train
-    before = opened.psnr(whole, views) if config.max_loss else math.inf
+    enough = opened.psnr(whole, views) - config.max_loss if config.max_loss else -math.inf
 
     def changed(splats: SplatArrays) -> tuple[float, float]:
         before, after = (model_of(some, opened.setting).activated() for some in (whole, splats))
         cameras = [view.camera for view in views]
         return largest_change(before, after, cameras, opened.setting.background, opened.setting.options)
 
+    if file.splats.sh.shape != whole.sh.shape and not config.steps:
+        if config.tolerance or opened.psnr(file.splats, views) < enough:
+            raise InputError(f"{output}: such a file has no room for harmonics, which would cost more than is allowed.")
     if config.tolerance:
         _, count = _narrowed(0, total, lambda count: changed(made(count))[1] > config.tolerance)
     elif config.max_loss:
         spare = min(HARMONICS_LOSS, config.max_loss / 2) if file.splats.sh.shape[1] > 1 else 0.0
-        enough = before - config.max_loss + spare
-        _, count = _narrowed(0, total, lambda count: opened.psnr(made(count), views) < enough)
+        _, count = _narrowed(0, total, lambda count: opened.psnr(made(count), views) < enough + spare)
     else:
         count = _count(config, output, file, thinning.to)
     splats = file.splats if config.max_loss and count == total else made(count)  # no fewer keep it
     if not config.tolerance:
-        splats = fewer_harmonics(opened, splats, before - config.max_loss if config.max_loss else None)
+        splats = fewer_harmonics(opened, splats, enough if config.max_loss else None)
     if config.size and config.steps:  # trained numbers are harder to pack
         thinning = Thinning(splats, opened.setting)
         splats = thinning.to(_count(config, output, file._replace(splats=splats), thinning.to))
