@@ -64,8 +64,9 @@ def forking():
     return processes
 
 
-def _as_torchrun_starts_it(group, said, words):
-    os.environ.update(group)
+def _as_torchrun_starts_it(environment, said, words):
+    os.environ.clear()  # that of the first one forked
+    os.environ.update(environment)
     os.dup2(said := os.open(said, os.O_WRONLY | os.O_APPEND | os.O_CREAT), 1)
     os.dup2(said, 2)
     sys.argv = list(words)
@@ -76,13 +77,16 @@ def together(count, *words):
     """A script by so many processes, as torchrun starts them, which takes longer: their exit codes, what they said."""
     with tempfile.TemporaryDirectory() as folder, socket.socket() as free:
         free.bind(("127.0.0.1", 0))
-        every = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free.getsockname()[1]), "WORLD_SIZE": str(count)}
+        every = {**os.environ, "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free.getsockname()[1])}
+        every |= {"WORLD_SIZE": str(count), "LOCAL_WORLD_SIZE": str(count), "OMP_NUM_THREADS": "1"}
         free.close()
         said = Path(folder) / "said.txt"
-        ranks = [{**every, "LOCAL_WORLD_SIZE": str(count), "RANK": str(n), "LOCAL_RANK": str(n)} for n in range(count)]
+        ranks = [{**every, "RANK": str(rank), "LOCAL_RANK": str(rank)} for rank in range(count)]
         processes = [forked_process(_as_torchrun_starts_it, rank, said, [*map(str, words)]) for rank in ranks]
         for process in processes:
             process.join(PATIENCE)
+            process.kill()  # where it hangs
+            process.join()
         return [process.exitcode for process in processes], said.read_text()
 
 
