@@ -56,6 +56,11 @@ def test_grounds(scene, options, count, reason):
     assert told.startswith("About ") and f" at {count} Gaussians (" in told and reason in told
 
 
+def test_points_may_be_more_than_a_photograph_asks_for():
+    count, reason = memory.expected_gaussians(500, pixels=900)
+    assert count == 500 and reason.startswith("as at the beginning, and more")
+
+
 def test_photographs_that_are_decoded_later_count(scene):
     told = []
     for later in (0.0, 3.0 * memory.GIB):

@@ -342,6 +342,8 @@ def test_its_strategies_grow_a_model(name, packed, steps, monkeypatch):
         ({"tile_size": 0}, "tile_size: expected a whole number, at least 1, got 0"),
         ({"eps2d": -1.0}, "eps2d: expected a number, at least 0"),
         ({"sh_degree": 5}, "sh_degree: expected 0 to 4 or None, got 5"),
+        ({"sh_degree": 1.0}, "sh_degree: expected 0 to 4 or None, got 1.0"),
+        ({"means": torch.zeros(0, 120, 3)}, r"means: expected a scene or more, got \[0, 120, 3\]"),
         ({"sh_degree": 3}, "colors: expected 16 or more coefficients"),
         ({"sh_degree": None}, r"colors: expected shape \[..., N, D\]"),
         ({"means": torch.zeros(3)}, r"means: expected a tensor \[..., N, 3\]"),

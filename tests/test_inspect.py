@@ -275,6 +275,7 @@ def test_other_endings_and_two_kinds_of_light(tmp_path, capsys):
     (root / "images" / "more.exr").rename(root / "images" / "b.exr")
     findings, _ = examine(root, tmp_path, capsys, 1)
     assert any(found == "error" and "b.png in linear light" in text for found, _, text in findings)
+    assert not any(check == "unregistered" for _, check, _ in findings)
 
 
 def test_a_few_steps_tell_how_long_a_training_takes(tmp_path, capsys, monkeypatch):

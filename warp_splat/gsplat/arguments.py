@@ -56,6 +56,8 @@ def check_request(request: Request) -> Request:
     if not isinstance(viewmats, torch.Tensor) or viewmats.dim() < 3 or viewmats.shape[-3] < 1:
         raise InputError(f"viewmats: expected a tensor [..., C, 4, 4], got {_found(viewmats)}.")
     batch, count, cameras = tuple(means.shape[:-2]), means.shape[-2], viewmats.shape[-3]
+    if 0 in batch:
+        raise InputError(f"means: expected a scene or more, got {list(means.shape)}.")
     if request.covars is not None:  # then these are ignored
         given = given | {"quats": means.new_ones(*batch, count, 4), "scales": means.new_ones(*batch, count, 3)}
     _check_tensor("colors", colors, None, means.device)
@@ -142,7 +144,7 @@ def _check_choices(request: Request) -> str:
     for name in ("near_plane", "far_plane", "radius_clip", "eps2d"):
         if not isinstance(given[name], numbers.Real) or not float(given[name]) >= 0.0:
             raise InputError(f"{name}: expected a number, at least 0, got {given[name]!r:.60}.")
-    if isinstance(request.sh_degree, bool) or not is_one_of(request.sh_degree, (None, *range(5))):
+    if isinstance(request.sh_degree, (bool, float)) or not is_one_of(request.sh_degree, (None, *range(5))):
         raise InputError(f"sh_degree: expected 0 to 4 or None, got {request.sh_degree!r:.60}.")
     return shutter.removeprefix("GLOBAL")
 

@@ -92,6 +92,7 @@ def check_names(subject: Subject) -> Iterator[Finding]:
         yield Finding("duplicates", "ok", "no image occurs twice.")
     if subject.model is not None and subject.root.is_dir():
         known = {subject.model.image(i).name for i in subject.model.reg_image_ids()}
+        known |= {photo.path.relative_to(subject.root).as_posix() for photo in subject.photos}  # found by their stems
         if extra := [name for name in find_files(subject.root, READABLE) if name not in known]:
             text = f"{len(extra)} images in {subject.root} have no camera and are not used: {few(extra)}."
             yield Finding("unregistered", "note", text)

@@ -133,7 +133,7 @@ def require_unmasked(count: int, black: int, source: str | Path, kind: str = "")
     if 0 < count == black:
         raise InputError(
             f"{source}: expected masks that leave something to train on, and to test with, but those of all {count} "
-            f"images{kind} are black; use --invert_masks, change the masks{', or leave out --eval' * bool(kind)}."
+            f"images{kind} are black; use --invert_masks, or change the masks{', or leave out --eval' * bool(kind)}."
         )
 
 

@@ -90,5 +90,6 @@ def expected_gaussians(beginning: int, pixels: int, limit: int = 0, grows: bool 
         return beginning, "as at the beginning"
     if limit:
         return (limit, "--max_gaussians") if limit >= beginning else (beginning, "as at the beginning")
-    guess = max(beginning, pixels // PIXELS)
+    if beginning >= (guess := pixels // PIXELS):
+        return beginning, "as at the beginning, and more as they grow; --max_gaussians limits them"
     return guess, f"guessed: one for {PIXELS} px of a photograph; --max_gaussians limits them"
