@@ -65,7 +65,7 @@ def simplify(config: SimplifyConfig) -> int:
 
     if file.splats.sh.shape != whole.sh.shape and not config.steps:
         if config.tolerance or opened.psnr(file.splats, views) < enough:
-            raise InputError(f"{output}: such a file has no room for harmonics, which would cost more than is allowed.")
+            raise InputError(f"{output}: expected a format with room for harmonics; this loses more than allowed.")
     if config.tolerance:
         _, count = _narrowed(0, total, lambda count: changed(made(count))[1] > config.tolerance)
     elif config.max_loss:
