@@ -72,7 +72,7 @@ def test_photographs_that_are_masked_all_over_are_left_out(tmp_path, monkeypatch
         assert "Leaving out 1 of 3" in lines[-1]
     for name in "bc":
         write_image(root / "masks" / f"{name}.png", black)
-    refusal(lambda: load(root), "all 3 images are black; use --invert_masks, change the masks.")
+    refusal(lambda: load(root), "all 3 images are black; use --invert_masks, or change the masks.")
     refusal(lambda: load(root, eval=True), "all 2 images are black")
     for name in "bc":
         (root / "masks" / f"{name}.png").unlink()
