@@ -135,7 +135,7 @@ def write(path: Path, finished: Finished, splats: SplatArrays) -> int:
     saved = save_somewhere(path, lambda place: save_gaussians(place, after, notes.append))
     with suppress(InputError, OSError):  # of the folder for temporary files
         size = f", {written_bytes(path, after) / 1e6:.2f} of {written_bytes(path, before) / 1e6:.2f} MB"
-    if splats.sh.shape[1] < before.splats.sh.shape[1]:
+    if before.splats.sh[:, splats.sh.shape[1] :].any():
         notes.append("all harmonics, for which such a file has no room")
     print(f"{saved}: {len(splats.means)} of {len(before.splats.means)} Gaussians{size}")
     if notes:

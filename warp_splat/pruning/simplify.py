@@ -63,8 +63,9 @@ def simplify(config: SimplifyConfig) -> int:
         cameras = [view.camera for view in views]
         return largest_change(before, after, cameras, opened.setting.background, opened.setting.options)
 
-    if file.splats.sh.shape != whole.sh.shape and not config.steps:
-        if config.tolerance or opened.psnr(file.splats, views) < enough:
+    if whole.sh[:, file.splats.sh.shape[1] :].any() and not config.steps:
+        broken = config.tolerance and changed(file.splats)[1] > config.tolerance
+        if broken or opened.psnr(file.splats, views) < enough:
             raise InputError(f"{output}: expected a format with room for harmonics; this loses more than allowed.")
     if config.tolerance:
         _, count = _narrowed(0, total, lambda count: changed(made(count))[1] > config.tolerance)
