@@ -16,6 +16,7 @@ from warp_splat.errors import InputError, tell
 from warp_splat.flags import FOREIGN_FLAGS, check_numbers, default_of, flags_of, purpose_of
 from warp_splat.presets import EMBEDDED_DEFAULTS, PRESETS
 from warp_splat.runtime.interrupts import ending_as_by_ctrl_c, leaving_at_once
+from warp_splat.text import upward
 from warp_splat.training.options import FIXED_OPTIONS, TrainConfig, check_train
 from warp_splat.training.parts import AUTO, PARTS
 
@@ -168,7 +169,7 @@ def _continued(given: dict) -> dict:
             "with --iterations."
         )
     if (minutes := given.get("minutes")) and (spent := load_header(source).fact("spent", float)) >= 60 * minutes:
-        raise InputError(f"--minutes {minutes:g}: expected more than the {spent / 60:.2f} that {source} has taken.")
+        raise InputError(f"--minutes {minutes:g}: expected more than the {upward(spent / 60)} that {source} has taken.")
     return _over(options, given)
 
 

@@ -84,7 +84,7 @@ def simplify(config: SimplifyConfig) -> int:
     if config.tolerance:
         measured, bound = changed(splats)
         found = f"{measured:.2g} measured, {upward(bound)} its bound"
-        print(f"  largest change of a pixel, {len(views)} training views: {found}")
+        print(f"  largest change of a pixel, before the format rounds, {len(views)} training views: {found}")
         if bound > config.tolerance:
             print("  Without any change, the bound of rounding is more: nothing is left out; raise --tolerance.")
     numbers = np.bincount(degrees_of(splats))
