@@ -65,7 +65,7 @@ def simplify(config: SimplifyConfig) -> int:
 
     if whole.sh[:, file.splats.sh.shape[1] :].any() and not config.steps:
         broken = config.tolerance and changed(file.splats)[1] > config.tolerance
-        if broken or opened.psnr(file.splats, views) < enough:
+        if broken or (config.max_loss and opened.psnr(file.splats, views) < enough):
             raise InputError(f"{output}: expected a format with room for harmonics; this loses more than allowed.")
     if config.tolerance:
         _, count = _narrowed(0, total, lambda count: changed(made(count))[1] > config.tolerance)
