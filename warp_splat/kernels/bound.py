@@ -16,7 +16,7 @@ import warp as wp
 from warp_splat.config import TILE
 from warp_splat.kernels.compiler import FORWARD_ONLY, once
 from warp_splat.kernels.falloff import LOG2_E, FalloffFunctions
-from warp_splat.kernels.simd import fill, fma, times, where_less
+from warp_splat.kernels.simd import fill, fma, smaller, times, where_less
 from warp_splat.kernels.structs import BinsView, Splats2DView
 from warp_splat.kernels.tiles import cut, outline, square_of
 
@@ -115,7 +115,7 @@ def brightness(color: wp.vec3, shade: float, usual: float):
 @wp.func
 def sure(raw: Any, alphas: wp.vec2, bound: BoundView):
     """Alpha in the ideal. What is fainter is left out, as subnormal numbers take many times as long."""
-    return where_less(raw, fill(bound.floor[1], raw), fill(0.0, raw), wp.min(raw, fill(alphas[1], raw)))
+    return where_less(raw, fill(bound.floor[1], raw), fill(0.0, raw), smaller(raw, fill(alphas[1], raw)))
 
 
 @wp.func

@@ -70,6 +70,11 @@ VECTORS = "".join(
 ) + _fused("V", "__builtin_elementwise_fma")
 
 
+def by_width(wide: str, narrow: str) -> str:
+    """In C++: ``wide`` where a register holds sixteen numbers, else ``narrow``."""
+    return f"\n#if defined(__AVX512F__)\n{wide}\n#else\n{narrow}\n#endif\n"
+
+
 def _vectors(result: str, adjoint: str = ";", kind: str = "float") -> tuple[str, str]:
     """A function in C++, which sees its arguments as vectors of sixteen, and what its adjoint does.
 
@@ -227,6 +232,12 @@ def where_less(a: float, b: float, x: float, y: float):
     if a < b:  # not wp.where, which cannot be called from Python
         return x
     return y
+
+
+@in_lanes("a < b ? a : b", "adj_a += a < b ? adj_ret : V{}; adj_b += a < b ? V{} : adj_ret;")
+def smaller(a: float, b: float):
+    """``b`` where ``a`` is NaN."""
+    return wp.min(a, b)
 
 
 @in_lanes("__builtin_convertvector(x, I)", kind="int")

@@ -27,7 +27,7 @@ import warp as wp
 
 from warp_splat.kernels.compiler import FORWARD_ONLY
 from warp_splat.kernels.falloff import Falloff
-from warp_splat.kernels.simd import fill, fma, negative, over, times, vec16, where_less
+from warp_splat.kernels.simd import fill, fma, negative, over, smaller, times, vec16, where_less
 from warp_splat.kernels.slots import CHANNEL
 
 wp.set_module_options(FORWARD_ONLY)
@@ -73,7 +73,7 @@ def exponent(dx: Any, dy: Any, xx: Any, xy: Any, yy: Any):
 @wp.func
 def alpha_of(raw: Any, alphas: wp.vec2):
     """Opacity of the Gaussian at the pixel, cut and clamped by ``alphas``; 0 where ``raw`` is negative."""
-    return where_less(raw, fill(alphas[0], raw), fill(0.0, raw), wp.min(raw, fill(alphas[1], raw)))
+    return where_less(raw, fill(alphas[0], raw), fill(0.0, raw), smaller(raw, fill(alphas[1], raw)))
 
 
 @wp.func

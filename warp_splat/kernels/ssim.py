@@ -219,7 +219,7 @@ def compare(
                 x[group + 1] = inside(a, start, length)
                 y[group + 1] = inside(b, start, length)
                 delta = inside(a - b + vec16(p - q), start, length)
-                difference = difference + wp.max(delta, -delta)
+                difference = difference + wp.abs(delta)
             if ahead >= bounds[band] and ahead < bounds[band + 1]:
                 sums_out[ahead, 0] = total(difference)
             window.blur_moments(x, y, ring[ahead & (window.RING - 1)])

@@ -9,7 +9,7 @@ from warp_splat.config import TILE
 from warp_splat.kernels.compiler import FORWARD_ONLY, once
 from warp_splat.kernels.cpu.blend import AHEAD, BLOCKS, LANE_X, LANE_Y, ROWS_AHEAD, aligned, walk
 from warp_splat.kernels.inline import kernel_of_parts
-from warp_splat.kernels.simd import LANES, VECTORS, fma, times, total, vec16, where_less
+from warp_splat.kernels.simd import LANES, VECTORS, by_width, fma, times, total, vec16, where_less
 from warp_splat.kernels.slots import CHANNEL, OPACITY, write_geometry
 from warp_splat.kernels.splat import BlendVariant, Splat2D
 from warp_splat.kernels.step import make_reverse_step
@@ -40,6 +40,11 @@ def folded(rows: wp.array[vec16], row: int) -> float:
 @wp.func_native(_fold(8, "wp::vec_t<8, float> sums; for (int i = 0; i < 8; i++) sums[i] = x[i]; return sums;"))
 def folded_eight(rows: wp.array[vec16], row: int) -> vec8:
     """Sums of eight rows of lanes, found together."""
+
+
+@wp.func_native(by_width("", "__atomic_signal_fence(__ATOMIC_ACQ_REL);"))
+def forget():
+    """What was read of memory is read anew: of too few registers, LLVM would store the sums twice to carry them on."""
 
 
 @once
@@ -141,6 +146,7 @@ def make_reverse(mode: str, variant: BlendVariant) -> wp.Kernel:
         )
         s[T + block] = front
         s[ADJ_T + block] = adj_front
+        forget()
         for grad in range(CHANNEL):
             s[SUMS + grad] = s[SUMS + grad] + part[grad]
         for channel in range(CHANNELS):

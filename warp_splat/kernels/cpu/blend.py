@@ -40,7 +40,7 @@ from warp_splat.kernels.cpu.ahead import ask
 from warp_splat.kernels.cpu.settle import SETTLED, make_settle, rows_from
 from warp_splat.kernels.falloff import make_falloff
 from warp_splat.kernels.inline import kernel_of_parts
-from warp_splat.kernels.simd import LANES, VECTORS, fma, lowest, times, total, vec16, where_less
+from warp_splat.kernels.simd import LANES, VECTORS, by_width, fma, lowest, times, total, vec16, where_less
 from warp_splat.kernels.splat import BlendVariant, Splat2D, advance, alpha_of, exponent, weight
 from warp_splat.kernels.structs import BinsView, PixelsView
 from warp_splat.kernels.tiles import first_pixel_of
@@ -90,24 +90,38 @@ def offset_y(mean: wp.vec2, y0: float, by: int):
     return offset_in_lanes(mean[1] - y0, LANE_Y, by)
 
 
-#: C++: a row of lanes as sixteen numbers of 16 bits, one for each block.
+#: C++: a row of lanes as sixteen numbers, one for each block. An element of a vector would go through the stack.
 _MARKS = (
-    "typedef unsigned short M; typedef M Row __attribute__((vector_size(32), aligned(2), may_alias)); "
-    "typedef bool B __attribute__((ext_vector_type(16))); auto marks = (Row*)(s.data + row); "
+    "typedef unsigned short M __attribute__((may_alias)); typedef M Row __attribute__((vector_size(32))); "
+    "typedef bool B __attribute__((ext_vector_type(16))); auto marks = (M*)(s.data + row); "
 )
+#: C++: where a pixel goes on, ``value``; else 0.
+_KEPT = VECTORS + "I kept = (I)((V&)behind < 0.0f ? V{} : (V&)value); "
 
 
 @wp.func_native(
-    _MARKS + VECTORS + "(*marks)[block] = __builtin_bit_cast(M, "
-    "__builtin_convertvector((V&)alpha > 0.0f, B) & __builtin_convertvector((V&)behind > 0.0f, B));"
-)
-def mark(s: wp.array[vec16], row: int, block: int, alpha: vec16, behind: vec16):
-    """Note in a row the lanes of a block that blend ``alpha``; their weight would underflow sooner."""
+    _MARKS + _KEPT + "marks[block] = "
+    + by_width("__builtin_bit_cast(M, __builtin_convertvector(kept != 0, B));", "__builtin_reduce_or(kept) != 0;")
+)  # fmt: skip
+def mark(s: wp.array[vec16], row: int, block: int, value: vec16, behind: vec16):
+    """Note in a row whether a lane of a block blends an alpha, its ``value``; its weight would underflow sooner."""
 
 
-@wp.func_native(_MARKS + "return __builtin_bit_cast(M, __builtin_convertvector(*marks != 0, B));")
+@wp.func_native(_MARKS + "return __builtin_bit_cast(M, __builtin_convertvector(*(Row*)marks != 0, B));")
 def marked(s: wp.array[vec16], row: int) -> int:
     """The blocks of which a lane was noted, a bit each."""
+
+
+@wp.func_native(
+    _KEPT + "wp::vec_t<16, float> r; (V&)r = "
+    + by_width("(V&)behind < 0.0f ? (V&)before : (V&)value;", "(V)__builtin_elementwise_max((I&)before, kept);")
+    + "return r;"
+)  # fmt: skip
+def farther(before: vec16, value: vec16, behind: vec16) -> vec16:
+    """Where a pixel goes on, ``value``, which is more than what was ``before``.
+
+    Found among integers, which have the same order: LLVM stores a choice by a mask, for which AVX2 of AMD takes long.
+    """
 
 
 @wp.func
@@ -203,7 +217,7 @@ def make_blend(variant: BlendVariant) -> wp.Kernel:
             may = unsure(raw, bound)
             s[TOTAL + block] = s[TOTAL + block] + may
             may = times(may, brightness(splat.color, bound.shade, bound.usual))
-            left = wp.max(s[IDEAL_T + block], -s[IDEAL_T + block])
+            left = wp.abs(s[IDEAL_T + block])
             s[ADDED + block] = own_light(left, may, bound.usual, s[ADDED + block])
         if wp.static(variant.ideal):
             ideal = times(sure(raw, alphas, bound), s[IDEAL_T + block])
@@ -224,7 +238,7 @@ def make_blend(variant: BlendVariant) -> wp.Kernel:
         if wp.static(CHANNELS > 3):
             s[DEPTH + block] = fma(w, splat.depth, s[DEPTH + block])
         s[T + block] = behind
-        s[WALKED + block] = where_less(behind, vec16(0.0), s[WALKED + block], walked)
+        s[WALKED + block] = farther(s[WALKED + block], walked, behind)
 
     def finish(k, splat, ahead, out, s, bins):
         bins.blocks[k] = marked(s, SEEN)
@@ -270,7 +284,7 @@ def make_blend(variant: BlendVariant) -> wp.Kernel:
         if wp.static(variant.bound):
             conclude(s, bound, tile, bins, length, background)
         for block in range(BLOCKS):
-            s[T + block] = wp.max(s[T + block], -s[T + block])
+            s[T + block] = wp.abs(s[T + block])
             final_out[tile, block] = s[T + block]
             count_out[tile, block] = s[WALKED + block]
         block = int(0)

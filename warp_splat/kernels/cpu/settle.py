@@ -51,7 +51,7 @@ def make_settle(rgb: int, rows: tuple[int, ...], ahead: int) -> tuple[wp.Functio
         begin = since.map
         block = int(0)
         while block < BLOCKS:  # Warp would unroll a range
-            t = wp.max(s[T + block], -s[T + block])  # negative where the picture stopped
+            t = wp.abs(s[T + block])  # negative where the picture stopped
             gained = vec16(0.0)
             light = vec16(0.0)
             for channel in range(3):
@@ -105,8 +105,8 @@ def make_settle(rgb: int, rows: tuple[int, ...], ahead: int) -> tuple[wp.Functio
         top = (tile // tiles_x) * TILE
         block = int(0)
         while block < BLOCKS:
-            t = wp.max(s[T + block], -s[T + block])
-            through = t - wp.max(s[block], -s[block])
+            t = wp.abs(s[T + block])
+            through = t - wp.abs(s[block])
             stopped = where_less(s[block], vec16(0.0), t, times(t, wp.where(cut, 1.0, 0.0)))
             last = wp.max(times(stopped, bound.brightest), times(t, bound.behind))
             taken = bounds.light_behind(s[TOTAL + block], last, s[TAKEN + block])
