@@ -74,16 +74,23 @@ def make_adam(lanes: int, sparse: bool, halves: bool = False) -> wp.Kernel:
         grads = wp.array(ptr=tables_out[table, 1] + begin, shape=(width,), dtype=number)
         firsts = wp.array(ptr=tables_out[table, 2] + begin_moments, shape=(width,), dtype=moment)
         seconds = wp.array(ptr=tables_out[table, 3] + begin_moments, shape=(width,), dtype=moment)
+        shown = int(0)
+        if wp.static(sparse):
+            for lane in range(lanes):
+                shown += wp.where(radii[lanes * group + lane] > 0, 1, 0)
+            if shown == 0:
+                return
         for i in range(width):
             grad = grads[i]
             before = widened(firsts[i])
             before2 = widened(seconds[i])
             value, m, v = adam_step_of(values[i], grad, before, before2, numbers, table)
             if wp.static(sparse):
-                mask = drawn(radii, lanes * group, lanes * i, width)
-                m = pick(mask, m, before)
-                v = pick(mask, v, before2)
-                value = pick(mask, value, values[i])
+                if shown < lanes:
+                    mask = drawn(radii, lanes * group, lanes * i, width)
+                    m = pick(mask, m, before)
+                    v = pick(mask, v, before2)
+                    value = pick(mask, value, values[i])
             values[i] = value
             if wp.static(halves):
                 bits = noise((start + lanes * group) * width + lanes * i, keys[table], grad)
