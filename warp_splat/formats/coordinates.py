@@ -6,6 +6,7 @@ east, y down, z north, as of a camera that looks north: so every format and view
 
 import json
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -39,10 +40,9 @@ def write_coordinates(folder: str | Path, coordinates: dict | None) -> None:
 
 def kept(found: object, axes: str = AXES) -> dict | None:
     """What a file of Gaussians with these ``axes`` repeats of them; None if they are none, or damaged."""
-    try:
+    with suppress(Unexpected, ValueError, TypeError, OverflowError):
         return {**{name: checked(found).get(name) for name in KEPT}, "axes": axes}
-    except (Unexpected, ValueError, TypeError, OverflowError):
-        return None
+    return None
 
 
 def comments_of(coordinates: dict | None) -> list[str]:
@@ -54,10 +54,9 @@ def comments_of(coordinates: dict | None) -> list[str]:
 def of_comments(comments: Sequence[str]) -> dict | None:
     """What the comments of a PLY file repeat of them."""
     text = next((comment for comment in comments if comment.startswith(COMMENT)), COMMENT)
-    try:
+    with suppress(ValueError, RecursionError):
         return kept(json.loads(text.removeprefix(COMMENT)))
-    except (ValueError, RecursionError):
-        return None
+    return None
 
 
 def checked(found: object) -> dict:

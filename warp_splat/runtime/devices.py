@@ -4,7 +4,7 @@ import math
 import re
 import sys
 from collections.abc import Iterable, Iterator, Sized
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import torch
@@ -95,9 +95,9 @@ def peak_memory() -> int | None:
     status = Path("/proc/self/status")  # Linux; what getrusage tells there begins with the peak of the parent process
     if status.exists() and (peak := re.search(r"VmHWM:\s*(\d+) kB", status.read_text())):
         return int(peak[1]) // 1024
-    try:
+    with suppress(ImportError):
         import resource  # noqa: PLC0415 - not on Windows
-    except ImportError:
-        return None
-    unit = 1024 * 1024 if sys.platform == "darwin" else 1024
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // unit
+
+        unit = 1024 * 1024 if sys.platform == "darwin" else 1024
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // unit
+    return None

@@ -13,6 +13,7 @@ All memory is torch's, on either device: its caching allocator gives what a stag
 import ctypes
 import functools
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from typing import Any
 
 import psutil
@@ -63,13 +64,11 @@ def _keep_freed_memory() -> None:
     A step allocates tens of megabytes; first touches of fresh pages cost 1 to 5 us each on virtual machines, up to
     half of a step. Elsewhere than on glibc nothing happens. No difference: huge pages (glibc.malloc.hugetlb=1).
     """
-    try:
+    with suppress(OSError, AttributeError):
         mallopt = ctypes.CDLL("libc.so.6").mallopt
-    except (OSError, AttributeError):
-        return
-    m_trim_threshold, m_mmap_max = -1, -4  # of malloc.h
-    mallopt(m_mmap_max, 0)
-    mallopt(m_trim_threshold, 2**31 - 1)
+        m_trim_threshold, m_mmap_max = -1, -4  # of malloc.h
+        mallopt(m_mmap_max, 0)
+        mallopt(m_trim_threshold, 2**31 - 1)
 
 
 def available_memory(device: torch.device) -> int:

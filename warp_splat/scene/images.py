@@ -8,7 +8,7 @@ orientation tag of EXIF is ignored: structure from motion saw the pixels as stor
 import math
 import re
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import reduce
 from pathlib import Path
@@ -336,10 +336,9 @@ def _decoded(path: Path, file: oiio.ImageInput, *what) -> np.ndarray:
 
 def _text(get: Callable[..., str], *arguments: str) -> str:
     """What ``get`` returns; damaged files hold bytes that are no text."""
-    try:
+    with suppress(UnicodeDecodeError):
         return get(*arguments)
-    except UnicodeDecodeError:
-        return "text that is damaged"
+    return "text that is damaged"
 
 
 def _unreadable(path: Path, error: str) -> InputError:
