@@ -72,7 +72,8 @@ def adjoints():
                 of = [ast.unparse(d.args[0]) for d in node.decorator_list if "func_grad" in ast.unparse(d)]
                 if of or node.name.startswith("adj_"):
                     found[isinstance(node.body[-1], ast.Pass)].add((of or [node.name.removeprefix("adj_")])[0])
-                if any("func_native" in d or "in_lanes" in d for d in decorators):  # in C++
+                without = any("without_gradient" in d for d in decorators)
+                if without or any("func_native" in d or "in_lanes" in d for d in decorators):  # in C++
                     found[not any("adj_ret" in d for d in decorators)].add(node.name)
     return found[False], found[True]
 

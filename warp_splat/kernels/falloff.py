@@ -18,6 +18,7 @@ import warp as wp
 
 from warp_splat.errors import InputError
 from warp_splat.kernels.compiler import FORWARD_ONLY, once
+from warp_splat.kernels.inline import without_gradient
 from warp_splat.kernels.simd import LANES, fill, fma, fraction, halved, times, vec16, whole
 
 wp.set_module_options(FORWARD_ONLY)
@@ -97,13 +98,9 @@ def make_fall_value(falloff: Falloff | int | None, number: type) -> wp.Function:
     """The falloff without its gradient, which what knows the value supplies."""
     fall_at = make_falloff(falloff).value
 
-    @wp.func
+    @without_gradient(number)
     def fall_value(z: number):
         return fall_at(z)
-
-    @wp.func_grad(fall_value)
-    def adj_fall_value(z: number, adj_ret: number):
-        pass
 
     return fall_value
 

@@ -6,6 +6,7 @@ import warp as wp
 
 from warp_splat.kernels import simd
 from warp_splat.kernels.compiler import once
+from warp_splat.kernels.inline import without_gradient
 from warp_splat.kernels.simd import TYPES, fill, fma, inner, inverse, root
 
 C0 = 0.28209479177387814
@@ -67,16 +68,12 @@ def make_harmonics(lanes: int) -> Harmonics:
         b0, b1, b2, b3, b4, b5, b6, b7, b8, b9, b10, b11, b12, b13, b14 = basis(x, y, z)
         return table_of(b0, b1, b2, b3, b4, b5, b6, b7, b8, b9, b10, b11, b12, b13, b14)
 
-    @wp.func
+    @without_gradient(number)  # nobody asks, and it would take a fifth of the adjoint
     def value_of(rows: table, k: int):
         if wp.static(lanes == 1):
             return rows[k, 0]
         else:
             return rows[k]
-
-    @wp.func_grad(value_of)
-    def adj_value_of(rows: table, k: int, adj_ret: number):  # nobody asks, and it would take a fifth of the adjoint
-        pass
 
     @wp.func
     def weigh(x: number, y: number, z: number, weights: table):

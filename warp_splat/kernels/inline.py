@@ -27,6 +27,20 @@ def defined(name: str, source: str, names: dict) -> Callable:
     return names[name]
 
 
+def without_gradient(*results: type) -> Callable[[Callable], wp.Function]:
+    """Decorate a function of Warp with these results: its adjoint does nothing."""
+
+    def decorate(function: Callable) -> wp.Function:
+        made, name = wp.func(function), f"adj_{function.__name__}"
+        types = function.__annotations__ | {f"adj_ret{place}": result for place, result in enumerate(results)}
+        nothing = defined(name, f"def {name}({', '.join(types)}):\n    pass\n", {})
+        nothing.__annotations__ = types
+        wp.func_grad(made)(nothing)
+        return made
+
+    return decorate
+
+
 def kernel_of_parts(module_options: dict, **parts: Part) -> Callable:
     """A decorator: the kernel with the bodies of ``parts`` in place of ``a, b = part(c, d)``, in a module of its own.
 

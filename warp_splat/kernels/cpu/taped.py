@@ -23,6 +23,7 @@ import warp as wp
 from warp_splat.kernels.compiler import DIFFERENTIABLE, once
 from warp_splat.kernels.cpu.blend import BLOCKS, LANE_X, LANE_Y, corner, reach
 from warp_splat.kernels.falloff import make_fall_value, make_falloff
+from warp_splat.kernels.inline import without_gradient
 from warp_splat.kernels.simd import fma, times, total, vec16, where_less
 from warp_splat.kernels.slots import CHANNEL, MEAN_X, MEAN_Y, OPACITY, XX, XY, YY, write_geometry
 from warp_splat.kernels.splat import BlendVariant, Splat2D, alpha_of, exponent, odds_of
@@ -30,7 +31,7 @@ from warp_splat.kernels.step import conic_from_root, opaque
 from warp_splat.kernels.structs import BinsView
 
 
-@wp.func
+@without_gradient()
 def begin(t: wp.array[vec16], final: wp.array2d[vec16], tile: int):
     for block in range(BLOCKS):
         t[block] = vec16(1.0)
@@ -40,11 +41,6 @@ def begin(t: wp.array[vec16], final: wp.array2d[vec16], tile: int):
 def replay_begin(t: wp.array[vec16], final: wp.array2d[vec16], tile: int):
     for block in range(BLOCKS):
         t[block] = final[tile, block]
-
-
-@wp.func_grad(begin)
-def adj_begin(t: wp.array[vec16], final: wp.array2d[vec16], tile: int):
-    pass
 
 
 @wp.func

@@ -14,28 +14,16 @@ import warp as wp
 
 from warp_splat.kernels.columns import columns, rows
 from warp_splat.kernels.compiler import DIFFERENTIABLE, once
-from warp_splat.kernels.inline import kernel_of_parts
+from warp_splat.kernels.inline import kernel_of_parts, without_gradient
 from warp_splat.kernels.project import Projection
 from warp_splat.kernels.project.camera_view import CameraView, turn
-from warp_splat.kernels.project.extent import covers_pixel, make_support
+from warp_splat.kernels.project.extent import make_extent
 from warp_splat.kernels.project.image import parts_of_image
 from warp_splat.kernels.project.pieces import all_finite, offset, rotation, sized_or_one, taken_along, turned_or_not
-from warp_splat.kernels.simd import TYPES, equal, fill, fma, inverse, less, pick, real, root, some, times, vec16, whole
+from warp_splat.kernels.simd import TYPES, equal, fill, fma, inverse, less, pick, real, root, some, times, whole
 
 UNSEEN = wp.constant(1)  # what radii hold before the forward pass
 INVALID = wp.constant(-1)  # not finite, as an input or when projected, or a quaternion of zero
-
-
-for number in (float, vec16):
-
-    @wp.func
-    def largest(a: number, b: number, c: number, d: number):
-        """The largest magnitude, without a gradient: it chooses a factor that normalization takes out again."""
-        return wp.max(wp.max(wp.max(a, -a), wp.max(b, -b)), wp.max(wp.max(c, -c), wp.max(d, -d)))
-
-    @wp.func_grad(largest)
-    def adj_largest(a: number, b: number, c: number, d: number, adj_ret: number):
-        pass
 
 
 @once
@@ -53,10 +41,15 @@ def make_project(projection: Projection, reach_of: wp.Function, lanes: int, expo
     number, integer, row2, row3, row4 = TYPES[lanes]
     turns = wp.array2d[row4] if expose else wp.array[row4]
 
-    support = make_support(reach_of, lanes)
+    support, covers_pixel = make_extent(reach_of, lanes)
     parts = {"all_finite": all_finite, "offset": offset, "turned_or_not": turned_or_not, "rotation": rotation}
     parts |= {"taken_along": taken_along, "sized_or_one": sized_or_one} | parts_of_image(projection, lanes)
     image = parts["image"]
+
+    @without_gradient(number)
+    def largest(a: number, b: number, c: number, d: number):
+        """The largest magnitude; no gradient, since it chooses a factor that normalization takes out again."""
+        return wp.max(wp.max(wp.max(a, -a), wp.max(b, -b)), wp.max(wp.max(c, -c), wp.max(d, -d)))
 
     @kernel_of_parts(DIFFERENTIABLE, **parts)
     def project(
