@@ -10,7 +10,7 @@ import numpy as np
 from warp_splat.errors import InputError
 from warp_splat.formats.files import Unexpected, json_object, reading
 from warp_splat.scene import takes_colmap
-from warp_splat.scene.images import read_numbers, same_shape
+from warp_splat.scene.images import read_numbers, require_shape
 from warp_splat.scene.types import Scene, View
 
 ENDINGS = (".png", ".exr")
@@ -87,11 +87,7 @@ def _read(path: Path, view: View, scale: float, offset: float) -> np.ndarray:
     """The numbers nearest to each pixel, which no filter mixes over edges."""
     numbers, (height, width) = read_numbers(path), (view.camera.height, view.camera.width)
     file = view.original.width, view.original.height
-    if not same_shape(numbers.shape[::-1], file):
-        raise InputError(
-            f"{path}: expected a map of {file[0]} x {file[1]} pixels as its photograph has, or scaled by one factor, "
-            f"got {numbers.shape[1]} x {numbers.shape[0]}; make it from the photograph."
-        )
+    require_shape(path, "map", numbers.shape[::-1], file, "make it from the photograph")
     rows, columns = nearest_of(height, numbers.shape[0]), nearest_of(width, numbers.shape[1])
     picked = numbers[rows[:, None], columns]
     found = np.where(picked < 0.0, np.nan, picked) * scale + offset

@@ -119,6 +119,15 @@ def same_shape(size: tuple[int, int], other: tuple[int, int]) -> bool:
     return abs(size[0] * other[1] - size[1] * other[0]) < other[0] + other[1]
 
 
+def require_shape(path: Path, kind: str, found: tuple[int, ...], size: tuple[int, int], advice: str) -> None:
+    """Refuse a ``kind`` of picture of a photograph of ``size`` that is not of the :func:`same_shape`."""
+    if not same_shape((found[0], found[1]), size):
+        raise InputError(
+            f"{path}: expected a {kind} of {size[0]} x {size[1]} pixels as its photograph has, or scaled by one "
+            f"factor, got {found[0]} x {found[1]}; {advice}."
+        )
+
+
 def read_pixels(path: Path, background: float) -> LoadedImage:
     """Read an image, 0..1 or in linear light; gray becomes RGB, alpha is composited on ``background``.
 
@@ -187,11 +196,7 @@ def read_mask(path: Path, size: tuple[int, int], invert: bool) -> np.ndarray:
     planes = np.moveaxis(read_pixels(path, 0.0).color if pixels is None else pixels, 2, 0)
     brightness = reduce(np.maximum, planes)  # a tenth of the time of max(axis=2)
     found = brightness.shape[1], brightness.shape[0]
-    if not same_shape(found, size):
-        raise InputError(
-            f"{path}: expected a mask of {size[0]} x {size[1]} pixels as its photograph has, or scaled by one factor, "
-            f"got {found[0]} x {found[1]}; draw it on the photograph, or remove it."
-        )
+    require_shape(path, "mask", found, size, "draw it on the photograph, or remove it")
     half = brightness.dtype.type(0.5 * brightness.max())  # of bytes rounded down: the same ones are brighter
     bright = ((brightness > half) != invert).astype(np.float32)
     return bright if found == size else resize(bright[..., None], *size)[..., 0]
