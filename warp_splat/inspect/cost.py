@@ -29,9 +29,9 @@ def check_cost(subject: Subject, say: Report) -> Iterator[Finding]:
         return
     say("Trying a few steps (kernels are compiled once on a machine, about 20 s) ...")
     device = settle_device("auto", 0, say=say)
-    sizes = [(view.camera.width, view.camera.height) for view in scene.train]
+    cameras = [view.camera for view in scene.train]
     try:
-        with memory_explained(device, scene.points, sizes, "take smaller images (-r), or fewer Gaussians"):
+        with memory_explained(device, scene.points, cameras, "take smaller images (-r), or fewer Gaussians"):
             yield from _tried(scene, device)
     except InputError as error:
         yield Finding("forecast", "warning", f"no more can be tried: {error}")

@@ -46,7 +46,7 @@ def explained(options: RasterOptions, means: torch.Tensor, cameras: Iterable[Cam
     """Turn into an InputError what memory that runs out says, and Warp of functions of the user's own."""
     advice = "render smaller images (Camera.resized) or fewer Gaussians"
     try:
-        with memory_explained(means.device, means, ((camera.width, camera.height) for camera in cameras), advice):
+        with memory_explained(means.device, means, cameras, advice):
             yield
     except Exception as error:
         words, functions = str(error.args[:1]), {"projection": options.projection, "falloff": options.falloff}

@@ -26,7 +26,7 @@ from warp_splat.formats.files import atomic_write
 from warp_splat.formats.png import save_png, save_video
 from warp_splat.gaussians import GaussianModel
 from warp_splat.raster.selftest import settle_device
-from warp_splat.rendering.camera_paths import ORBIT_SIZE, focus_orbit, origin_orbit, path_cameras, spiral_cameras
+from warp_splat.rendering.camera_paths import ORBIT_LENS, focus_orbit, origin_orbit, path_cameras, spiral_cameras
 from warp_splat.rendering.finished import Finished
 from warp_splat.rendering.popping import popping_of
 from warp_splat.runtime.devices import memory_explained
@@ -184,11 +184,10 @@ def _check(config: RenderConfig) -> None:
 
 def _memory_explained(device: torch.device, model: GaussianModel, scene: Scene | None):
     """See :func:`memory_explained`; without a scene, the images are those of an orbit."""
-    views = [*scene.train, *scene.test] if scene else []
-    sizes = [(view.camera.width, view.camera.height) for view in views] or [ORBIT_SIZE]
+    cameras = [view.camera for view in (*scene.train, *scene.test)] if scene else [ORBIT_LENS]
     fewer = ["trained with fewer Gaussians (--max_gaussians)", *(["on smaller images (-r)"] if scene else [])]
     elsewhere = ", or use --device cpu" if device.type == "cuda" else ""
-    return memory_explained(device, model, sizes, f"render a model {' or '.join(fewer)}{elsewhere}")
+    return memory_explained(device, model, cameras, f"render a model {' or '.join(fewer)}{elsewhere}")
 
 
 def _cameras(config: RenderConfig, scene: Scene | None) -> list[Camera]:

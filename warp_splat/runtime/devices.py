@@ -1,6 +1,5 @@
 """Which device a run uses, why a GPU cannot be used, and what to say when memory runs out."""
 
-import math
 import re
 import sys
 from collections.abc import Iterable, Iterator, Sized
@@ -10,6 +9,7 @@ from pathlib import Path
 import torch
 import warp as wp
 
+from warp_splat.camera import Camera
 from warp_splat.errors import InputError
 
 OUT_OF_MEMORY = ("out of memory", "not enough memory", "can't allocate memory", "Failed to allocate")
@@ -61,15 +61,13 @@ def _dotted(version: tuple[int, int]) -> str:
 
 
 @contextmanager
-def memory_explained(
-    device: torch.device, gaussians: Sized, sizes: Iterable[tuple[int, int]], advice: str
-) -> Iterator[None]:
+def memory_explained(device: torch.device, gaussians: Sized, cameras: Iterable[Camera], advice: str) -> Iterator[None]:
     """Turn an error that means that memory ran out into an InputError that says where, and what takes less.
 
     Args:
         device: where the work is done.
         gaussians: those at work when the error comes are counted.
-        sizes: width and height of the images [px]; the largest is told.
+        cameras: those of the images; the size of the largest is told.
         advice: what to do instead, an imperative.
     """
     try:
@@ -78,8 +76,8 @@ def memory_explained(
         if not is_out_of_memory(error):
             raise
         where = getattr(error, "__notes__", ["between two stages"])[0]
-        width, height = max(sizes, key=math.prod)
-        what = f"with {len(gaussians)} Gaussians on {width} x {height} px"
+        largest = max(cameras, key=lambda camera: camera.width * camera.height)
+        what = f"with {len(gaussians)} Gaussians on {largest.width} x {largest.height} px"
         raise InputError(f"Out of memory on {device.type} {where}, {what}; {advice}.") from error
 
 

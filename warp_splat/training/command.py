@@ -226,5 +226,4 @@ def _memory_explained(trainer: Trainer):
     """See :func:`memory_explained`."""
     rest = " or --data_device cpu" * (trainer.config.machine.data_device == "cuda")
     advice = f"train with fewer Gaussians (--max_gaussians) or smaller images (-r){rest}"
-    sizes = [(view.camera.width, view.camera.height) for view in trainer.scene.train]
-    return memory_explained(trainer.device, trainer.model, sizes, advice)
+    return memory_explained(trainer.device, trainer.model, (view.camera for view in trainer.scene.train), advice)

@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 REST = 0.25  # seconds without a movement after which a frame is drawn sharp
 FREE = "none"  # in the list of photographs
 FRAME_SECONDS = 0.1  # to draw one while moving: 10 per second, of which the way to the browser may take half
-LARGEST = (1920, 1080)  # px; a frame at rest has at most this area
-FEWEST, MOST = 100 * 100, LARGEST[0] * LARGEST[1]  # pixels
+LARGEST = Camera(1920, 1080, 1.0, 1.0, 0.0, 0.0, np.eye(3), np.zeros(3))  # a frame at rest has at most its area
+FEWEST, MOST = 100 * 100, LARGEST.width * LARGEST.height  # pixels
 CHANGE = (0.25, 1.5)  # from one frame to the next: down quickly, up slowly
 STEPS = {"previous": -1, "again": 0, "next": 1}
 
