@@ -76,16 +76,15 @@ def make_beside(variant: BlendVariant, most: int | None = None) -> wp.Kernel:
         t = s[T + block]
         alpha = opaque(fall * splat.opacity, alphas, here, s[WALKED + block])
         w = times(alpha, t)
+        behind = fma(-alpha, t, t)
+        s[T + block] = behind
         if wp.static(most is None):
-            s[T + block] = fma(-alpha, t, t)
             row = SUMS + block * WIDTH
             channel = int(0)
             while channel < channels:
                 s[row + channel] = fma(w, mine[channel], s[row + channel])
                 channel += 1
         else:
-            behind = fma(-alpha, t, t)
-            s[T + block] = behind
             median = s[MEDIAN + block]
             s[MEDIAN + block] = where_less(vec16(0.5), t, where_less(vec16(0.5), behind, median, here), median)
             place = here
