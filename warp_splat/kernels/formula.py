@@ -152,10 +152,8 @@ def _sqrt(notes: Notes, a: Number) -> Number:
 def _arctan2(notes: Notes, a: Number, b: Number) -> Number:
     square = notes.sum(notes.product(a.name, a.name), notes.product(b.name, b.name))
     per_square = notes.note("inverse", notes.real(square))
-    turns = (
-        notes.difference(notes.product(b.name, da), notes.product(a.name, db))
-        for da, db in zip(a.slopes, b.slopes, strict=True)
-    )
+    pairs = zip(a.slopes, b.slopes, strict=True)
+    turns = (notes.difference(notes.product(b.name, da), notes.product(a.name, db)) for da, db in pairs)
     slopes = (notes.product(turned, per_square) for turned in turns)
     return Number(notes, notes.note("angle", notes.real(a.name), notes.real(b.name)), tuple(slopes))
 

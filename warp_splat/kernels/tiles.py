@@ -118,8 +118,7 @@ def cut(
     if square != 0:
         right = x_extent
         left = -x_extent
-    first, last = pixels(x + left, x + right, width, margin)
-    return first, last
+    return pixels(x + left, x + right, width, margin)
 
 
 @wp.kernel
