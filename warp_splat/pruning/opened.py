@@ -45,7 +45,7 @@ class Opened(Finished):
         super().__init__(config.model, config.iteration)
         require_some(self)
         self.scene = self.refined(self.load_scene(config.source_path, print))
-        if found := self.trained_among(self.scene):
+        if found := self.scene.trained_among(self.path):
             print(f"{len(found)} photographs that are held out now, such as {found[0]}, were trained on: not used.")
             self.scene = replace(self.scene, test=[view for view in self.scene.test if view.name not in found])
         self.shows = self._crop(config.crop, used) if config.crop else None

@@ -109,7 +109,7 @@ def render_model(config: RenderConfig) -> int:
     given = scene = None
     if not config.orbit or config.orbit_center == "focus":  # the timed orbit around the origin looks at no camera
         given = finished.load_scene(config.source_path, say)
-        if not (config.skip_test or config.video or config.orbit) and (found := finished.trained_among(given)):
+        if not (config.skip_test or config.video or config.orbit) and (found := given.trained_among(path)):
             raise InputError(
                 f"{config.model_path}: expected to test on photographs that were held out, found {len(found)} that "
                 f"were trained on, such as {found[0]}; name the scene of then with -s, or use --skip_test."

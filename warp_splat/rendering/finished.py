@@ -14,7 +14,7 @@ from warp_splat.config import RasterOptions
 from warp_splat.errors import InputError
 from warp_splat.formats.coordinates import read_coordinates
 from warp_splat.formats.exposures import Exposures, read_exposures
-from warp_splat.formats.model_folder import folder_of, open_model, read_environment, read_refined, trained_names
+from warp_splat.formats.model_folder import folder_of, open_model, read_environment, read_refined
 from warp_splat.formats.splats import SplatFile
 from warp_splat.gaussians import GaussianModel
 from warp_splat.raster.api import RenderOutput, render
@@ -116,11 +116,6 @@ class Finished:
         scene = load_scene(source, **names, resolution=resolution, **flags, memory=photo_memory(), report=say)
         scene.refuse_other_frame(self.path, self.placed().coordinates)
         return scene
-
-    def trained_among(self, scene: Scene) -> list[str]:
-        """Photographs that are held out now and were trained on, as the scene has changed since: mostly none."""
-        trained = trained_names(self.path)
-        return [view.name for view in scene.test if view.name in trained]
 
     def refined(self, scene: Scene) -> Scene:
         """The scene with the cameras that were learned with the Gaussians; itself, if they were not.

@@ -15,7 +15,7 @@ from warp_splat.color import to_srgb
 from warp_splat.config import NEAR
 from warp_splat.errors import InputError
 from warp_splat.formats.coordinates import UP, read_coordinates
-from warp_splat.formats.model_folder import CAMERAS, folder_of, read_cameras
+from warp_splat.formats.model_folder import CAMERAS, folder_of, read_cameras, trained_names
 from warp_splat.formats.splats import SplatFile
 
 if TYPE_CHECKING:
@@ -192,6 +192,11 @@ class Scene:
                 f"{name}: expected cameras as in {self.source}, found a quarter of them moved or turned by {far:.0%} "
                 "of its size; name the scene that it was trained on, or a copy of its .ply (-m, --start_ply)."
             )
+
+    def trained_among(self, path: str | Path) -> list[str]:
+        """Photographs that are held out now, and on which the model at a path was trained: mostly none."""
+        trained = trained_names(path)
+        return [view.name for view in self.test if view.name in trained]
 
     @property
     def up(self) -> np.ndarray:

@@ -137,8 +137,7 @@ def open_scene(config: TrainConfig, begun: Checkpoint | None, say: Report, proce
         say("Warning: the scene has no points to start from; random ones are taken, which trains worse.")
     if scene.start:
         scene.refuse_other_frame(start, scene.start.coordinates)
-        known = model_folder.trained_names(start) if scene.test else ()
-        if found := [view.name for view in scene.test if view.name in known]:
+        if scene.test and (found := scene.trained_among(start)):
             say(f"Warning: {start} was trained on {len(found)} of {len(scene.test)} images that are held out.")
         if scene.start.antialiased != config.model.antialiasing:
             which = "with" if scene.start.antialiased else "without"
