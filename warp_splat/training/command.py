@@ -70,11 +70,10 @@ def _train_blocks(config: TrainConfig) -> int:
     if holds_another(folder):
         raise InputError(f"{folder}: it already holds another model; move it away, or choose another folder with -m.")
     opening.check_folder(config, folder)
-    say, numbers = opening.speaker(config.report.quiet), range(1, count + 1)
-    for number in numbers:
-        opening.refuse_other_block(config.changed(blocks=0, block=f"{number}/{count}"), folder / str(number))
-    for number in numbers:
-        place, block = folder / str(number), f"{number}/{count}"
+    say, blocks = opening.speaker(config.report.quiet), {f"{n}/{count}": folder / str(n) for n in range(1, count + 1)}
+    for block, place in blocks.items():
+        opening.refuse_other_block(config.changed(blocks=0, block=block), place)
+    for block, place in blocks.items():
         if (place / BLOCK).exists():
             say(f"Block {block}: trained to its end before, by the options of {place}/cfg_args.")
         elif code := _go_on(config, place, block=block, viewer=False, verify=""):
