@@ -64,10 +64,15 @@ def is_one_of(value: object, choices: Collection) -> bool:
     return (value is None or isinstance(value, (str, numbers.Real))) and value in choices
 
 
+def check_choice(name: str, value: object, choices: Collection) -> None:
+    """Raise InputError if ``value`` is none of ``choices``."""
+    if not is_one_of(value, choices):
+        raise InputError(f"{name}: expected one of {', '.join(map(str, choices))}, got {value!r}.")
+
+
 def check_options(adjoint: str, options: RasterOptions | None) -> RasterOptions:
     """The options to use, numbers as Python's. Raises InputError for an unknown adjoint or option."""
-    if not is_one_of(adjoint, config.ADJOINTS):
-        raise InputError(f"adjoint: expected one of {', '.join(config.ADJOINTS)}, got {adjoint!r}.")
+    check_choice("adjoint", adjoint, config.ADJOINTS)
     options = RasterOptions() if options is None else options
     if not isinstance(options, RasterOptions):
         raise InputError(f"options: expected a warp_splat.RasterOptions, got {type(options).__name__}.")
@@ -78,9 +83,7 @@ def check_options(adjoint: str, options: RasterOptions | None) -> RasterOptions:
         wanted = f"one of {', '.join(config.PROJECTIONS)} or a warp_splat.kernels.project.Projection"
         raise InputError(f"options.projection: expected {wanted}, got {options.projection!r}.")
     for name, choices in (("extent", config.EXTENTS), ("exp_degree", config.EXP_DEGREES), ("of", config.BOUNDS_OF)):
-        if not is_one_of(given[name], choices):
-            wanted = ", ".join(str(choice) for choice in choices)
-            raise InputError(f"options.{name}: expected one of {wanted}, got {given[name]!r}.")
+        check_choice(f"options.{name}", given[name], choices)
     if not (options.falloff is None or isinstance(options.falloff, Falloff)):
         raise InputError(f"options.falloff: expected a warp_splat.Falloff or None, got {options.falloff!r:.80}.")
     for name in ("depth", "antialiasing", "median_depth", "normals", "bound"):
@@ -183,6 +186,11 @@ def check_tensor(name: str, tensor, shape: tuple[int | str, ...], device: torch.
         raise InputError(
             f"{name}: expected a tensor on the CPU or an NVIDIA GPU, got one on {tensor.device}; move it with .cpu()."
         )
+    _check_place(name, tensor, device)
+
+
+def _check_place(name: str, tensor: torch.Tensor, device: torch.device | None) -> None:
+    """Raise InputError if ``tensor`` is sparse, or on another device than a given one."""
     if tensor.layout != torch.strided:
         raise InputError(f"{name}: expected a dense tensor, got one that is sparse; convert it with .to_dense().")
     if device is not None and tensor.device != device:
@@ -196,10 +204,7 @@ def check_background(background, device: torch.device) -> torch.Tensor:
             background = torch.tensor([float(value) for value in background], dtype=torch.float32, device="cpu")
         except (TypeError, ValueError, OverflowError):
             raise InputError(f"background: expected three numbers or a tensor [3], got {background!r:.80}.") from None
-    if background.layout != torch.strided:
-        raise InputError("background: expected a dense tensor, got one that is sparse; convert it with .to_dense().")
-    if given and background.device != device:
-        raise InputError(f"background: expected a tensor on {device}, as the means, got one on {background.device}.")
+    _check_place("background", background, device if given else None)
     if background.shape != (3,) or background.dtype != torch.float32 or not bool(torch.isfinite(background).all()):
         raise InputError(
             f"background: expected three finite numbers (a tensor: float32 [3]), got {background.dtype} "

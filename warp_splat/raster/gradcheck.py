@@ -179,8 +179,7 @@ def _check_falloff(falloff: Falloff, device: torch.device) -> None:
 
 def _check(adjoint, options, camera, parameters, directions, tolerance, seed) -> RasterOptions:
     """The options to use. Raises InputError for what :func:`check_gradients` itself demands of its arguments."""
-    if not checks.is_one_of(adjoint, MODES):
-        raise InputError(f"adjoint: expected one of {', '.join(MODES)}, got {adjoint!r}.")
+    checks.check_choice("adjoint", adjoint, MODES)
     known = differences.inputs_of(camera) + INTERMEDIATES
     given = parameters if isinstance(parameters, (list, tuple)) else ()
     if parameters is not None and not (given and all(checks.is_one_of(name, known) for name in given)):
