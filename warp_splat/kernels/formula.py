@@ -102,16 +102,13 @@ class Number(np.lib.mixins.NDArrayOperatorsMixin):
     def __init__(self, notes: Notes, name: Name, slopes: tuple[Name, ...] = ()):
         self.notes, self.name, self.slopes = notes, name, slopes
 
-    def __array_ufunc__(self, function: np.ufunc, method: str, *operands):
+    def __array_ufunc__(self, function: Callable, method: str, *operands):
         if method != "__call__" or function not in RULES:
             raise NotImplementedError(f"{function}: no rule for it; see warp_splat/kernels/formula.py")
         return RULES[function](self.notes, *_aligned(self.notes, operands))
 
     def __array_function__(self, function: Callable, _types, operands, _keywords):
-        if function is not np.where:
-            raise NotImplementedError(f"{function}: no rule for it; see warp_splat/kernels/formula.py")
-        mask, a, b = _aligned(self.notes, operands)
-        return _linear(lambda notes, *pair: notes.chosen(mask.name, *pair), self.notes, a, b)
+        return self.__array_ufunc__(function, "__call__", *operands)
 
 
 def _aligned(notes: Notes, operands: Sequence) -> list[Number]:
@@ -164,7 +161,7 @@ def _flat(operation: str, notes: Notes, *operands: Number) -> Number:
     return Number(notes, notes.note(operation, *names), (None,) * len(operands[0].slopes))
 
 
-#: What formulas may use besides ``np.where``.
+#: What formulas may use.
 RULES = {
     np.add: _add,
     np.subtract: _subtract,
@@ -176,6 +173,7 @@ RULES = {
     np.less: partial(_flat, "less"),
     np.floor: partial(_flat, "rounded_down"),
     np.greater: lambda notes, a, b: _flat("less", notes, b, a),
+    np.where: lambda notes, mask, a, b: _linear(lambda _, *pair: notes.chosen(mask.name, *pair), notes, a, b),
 }
 
 
