@@ -11,6 +11,7 @@ import threading
 import time
 import warnings
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -41,7 +42,7 @@ ADVICE = "view fewer Gaussians (train with --max_gaussians), or in a smaller win
 AS_GIVEN = ", as given"  # behind the name of a photograph whose camera was refined
 
 
-class Viewer:
+class Viewer(AbstractContextManager):
     """Serves the page, and draws what its browsers ask for.
 
     Args:
@@ -100,9 +101,6 @@ class Viewer:
             for kind in KINDS:
                 paint(self.draw_camera(camera, kind == "depth"), kind, self.linear)
             self.draw_camera(camera, median=True)
-
-    def __enter__(self) -> "Viewer":
-        return self
 
     def __exit__(self, *_) -> None:
         self.server.stop()
