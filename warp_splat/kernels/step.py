@@ -65,9 +65,9 @@ def geometry_from_moments(sums: Any, root: wp.vec3, opacity: float):
 class ReverseStep(NamedTuple):
     """One Gaussian and one pixel, or sixteen, in a reverse loop.
 
-    pixel(dx, dy, root, opacity, t, adj_t, alphas, here, walked, lit):
-        t: transmittance behind. adj_t: dL/dT behind, by hand times T. lit: what the pixel's gradient says of the
-        channels, color . u.
+    pixel(dx, dy, fall, root, opacity, t, adj_t, alphas, here, walked, lit):
+        fall: :func:`make_fall`'s answer. t: transmittance behind. adj_t: dL/dT behind, by hand times T. lit: what the
+        pixel's gradient says of the channels, color . u.
         -> T in front, that in front, the weight, and what to sum over pixels, in the columns before the channels'.
     geometry(sums, root, opacity):
         What these sums say of mean and conic.
@@ -75,6 +75,18 @@ class ReverseStep(NamedTuple):
 
     pixel: wp.Function
     geometry: wp.Function
+
+
+@once
+def make_fall(falloff: Falloff | int | None, number: type) -> wp.Function:
+    """The falloff at an offset from the mean [px], by the root of a Gaussian."""
+    fall_at = make_falloff(falloff).value
+
+    @func_of(number, root=wp.vec3)
+    def fall_of(dx, dy, root):
+        return fall_at(exponent(dx, dy, root[0], root[1], root[2]))
+
+    return fall_of
 
 
 @once
@@ -87,11 +99,10 @@ def make_reverse_step(mode: str, falloff: Falloff | int | None, number: type) ->
     if number is vec16:
         vec_sums = wp.types.matrix(shape=(CHANNEL, LANES), dtype=float)
     sums_of = wp.matrix_from_rows if number is vec16 else vec_sums
-    fall_at, step = make_falloff(falloff).value, make_step(falloff, number)
+    step = make_step(falloff, number)
 
     @func_of(number, root=wp.vec3, opacity=float, alphas=wp.vec2)
-    def by_hand(dx, dy, root, opacity, t, adj_t, alphas, here, walked, lit):
-        fall = fall_at(exponent(dx, dy, root[0], root[1], root[2]))
+    def by_hand(dx, dy, fall, root, opacity, t, adj_t, alphas, here, walked, lit):
         raw = where_less(here, walked, fall * opacity, fill(-1.0, dx))
         odds = odds_of(alpha_of(raw, alphas))
         w = times(t, odds)
@@ -118,8 +129,7 @@ def make_reverse_step(mode: str, falloff: Falloff | int | None, number: type) ->
         return front, fma(w, lit, adj_t), w, sums
 
     @func_of(number, root=wp.vec3, opacity=float, alphas=wp.vec2)
-    def stepwise(dx, dy, root, opacity, t, adj_t, alphas, here, walked, lit):
-        fall = fall_at(exponent(dx, dy, root[0], root[1], root[2]))
+    def stepwise(dx, dy, fall, root, opacity, t, adj_t, alphas, here, walked, lit):
         odds = odds_of(opaque(fall * opacity, alphas, here, walked))
         front = fma(t, odds, t)
         x, y, xx, xy, yy, adj_opacity, w, _fall, adj_front, _behind, _alphas, _here, _walked = wp.grad(step)(

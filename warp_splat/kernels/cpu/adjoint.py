@@ -12,7 +12,7 @@ from warp_splat.kernels.inline import kernel_of_parts
 from warp_splat.kernels.simd import LANES, VECTORS, by_width, fma, times, total, vec16, where_less
 from warp_splat.kernels.slots import CHANNEL, OPACITY, write_geometry
 from warp_splat.kernels.splat import BlendVariant, Splat2D
-from warp_splat.kernels.step import make_reverse_step
+from warp_splat.kernels.step import make_fall, make_reverse_step
 from warp_splat.kernels.structs import BinsView, PixelsView
 
 vec8 = wp.types.vector(length=8, dtype=float)
@@ -130,20 +130,20 @@ def make_reverse(mode: str, variant: BlendVariant) -> wp.Kernel:
     mat_room = wp.types.matrix(shape=(SUMS + GRADS + ROWS_AHEAD + 1, LANES), dtype=float)
     vec_grads = wp.types.vector(length=GRADS, dtype=float)
     (pixel, geometry), way, known = make_reverse_step(mode, variant.falloff, vec16), -1, True
+    fall_of = make_fall(variant.falloff, vec16)
 
     def begin(k, here, out, s):
         for grad in range(GRADS):
             s[SUMS + grad] = vec16(0.0)
         return 0
 
-    def step(k, splat, dx, dy, block, here, own, out, s, alphas):
+    def step(k, splat, dx, dy, fall, block, here, own, out, s, alphas):
         red, green, blue = s[UP + block], s[UP + BLOCKS + block], s[UP + 2 * BLOCKS + block]
         lit = fma(red, splat.color[0], fma(green, splat.color[1], blue * splat.color[2]))
         if wp.static(CHANNELS > 3):
             lit = fma(s[UP + 3 * BLOCKS + block], splat.depth, lit)
-        front, adj_front, w, part = pixel(
-            dx, dy, splat.root, splat.opacity, s[T + block], s[ADJ_T + block], alphas, here, s[WALKED + block], lit
-        )
+        t, adj_t, walked = s[T + block], s[ADJ_T + block], s[WALKED + block]
+        front, adj_front, w, part = pixel(dx, dy, fall, splat.root, splat.opacity, t, adj_t, alphas, here, walked, lit)
         s[T + block] = front
         s[ADJ_T + block] = adj_front
         forget()
@@ -196,6 +196,6 @@ def make_reverse(mode: str, variant: BlendVariant) -> wp.Kernel:
             for channel in range(CHANNELS):
                 s[UP + channel * BLOCKS + block] = up[tile, block * CHANNELS + channel]
         length = steps[tile]
-        walk(bins, near, start, length, way, known, slots_out, begin, step, finish)
+        walk(bins, near, start, length, way, known, slots_out, fall_of, begin, step, finish)
 
     return adj_blend

@@ -11,12 +11,11 @@ from warp_splat.config import TILE
 from warp_splat.kernels.compiler import FORWARD_ONLY, once
 from warp_splat.kernels.cpu.adjoint import folded
 from warp_splat.kernels.cpu.blend import AHEAD, BLOCKS, ROWS_AHEAD, aligned, walk
-from warp_splat.kernels.falloff import make_falloff
 from warp_splat.kernels.inline import kernel_of_parts
 from warp_splat.kernels.simd import LANES, equal, fma, pick, times, vec16, where_less
 from warp_splat.kernels.slots import CHANNEL, OPACITY, write_geometry
-from warp_splat.kernels.splat import BlendVariant, Splat2D, exponent
-from warp_splat.kernels.step import make_reverse_step, opaque
+from warp_splat.kernels.splat import BlendVariant, Splat2D
+from warp_splat.kernels.step import make_fall, make_reverse_step, opaque
 from warp_splat.kernels.structs import BinsView
 
 AT_ONCE = 32  # channels
@@ -63,7 +62,7 @@ def make_beside(variant: BlendVariant, most: int | None = None) -> wp.Kernel:
     With ``most``, instead the weights of so many strongest Gaussians, their places in the tile's list, and that of the
     Gaussian at which half of the light is gone.
     """
-    fall_at, way, known, WIDTH, MOST = make_falloff(variant.falloff).value, 1, True, AT_ONCE, most or 0
+    fall_of, way, known, WIDTH, MOST = make_fall(variant.falloff, vec16), 1, True, AT_ONCE, most or 0
     T, WALKED, SUMS, MEDIAN, WEIGHT, RANK = (place * BLOCKS for place in (0, 1, 2, 2, 3, 3 + MOST))
     STATE = RANK + MOST * BLOCKS if most is not None else SUMS + WIDTH * BLOCKS
     mat_room = wp.types.matrix(shape=(STATE + ROWS_AHEAD + 1, LANES), dtype=float)
@@ -71,8 +70,7 @@ def make_beside(variant: BlendVariant, most: int | None = None) -> wp.Kernel:
     def begin(k, here, out, bins, rows):
         return row_of_splat(rows, bins.instances[k])
 
-    def step(k, splat, dx, dy, block, here, mine, out, s, alphas, channels):
-        fall = fall_at(exponent(dx, dy, splat.root[0], splat.root[1], splat.root[2]))
+    def step(k, splat, dx, dy, fall, block, here, mine, out, s, alphas, channels):
         t = s[T + block]
         alpha = opaque(fall * splat.opacity, alphas, here, s[WALKED + block])
         w = times(alpha, t)
@@ -129,7 +127,7 @@ def make_beside(variant: BlendVariant, most: int | None = None) -> wp.Kernel:
             for j in range(MOST):
                 s[RANK + j * BLOCKS + block] = vec16(-1.0)
         length = steps[tile]
-        walk(bins, near, start, length, way, known, pixels_out, begin, step, finish)
+        walk(bins, near, start, length, way, known, pixels_out, fall_of, begin, step, finish)
         numbers = wp.array(ptr=s.ptr + wp.uint64(64 * SUMS), shape=((STATE - SUMS) * LANES,), dtype=float)
         pixel = int(0)
         while pixel < TILE * TILE:
@@ -159,6 +157,7 @@ def make_adj_channels(mode: str, variant: BlendVariant, most: int = 0) -> wp.Ker
     ``most``, instead that of the weights of so many of a pixel's Gaussians, which have no channels.
     """
     (pixel, geometry), way, known = make_reverse_step(mode, variant.falloff, vec16), -1, True
+    fall_of = make_fall(variant.falloff, vec16)
     WIDTH = most or AT_ONCE  # of a block's numbers
     geometric = bool(most) or mode == "absolute"  # channels have no gradients of their own
     T, ADJ_T, WALKED, UP = 0, BLOCKS, 2 * BLOCKS, 3 * BLOCKS
@@ -173,7 +172,7 @@ def make_adj_channels(mode: str, variant: BlendVariant, most: int = 0) -> wp.Ker
             row += 1
         return row_of_splat(rows, bins.instances[k])
 
-    def step(k, splat, dx, dy, block, here, mine, out, s, alphas, channels):
+    def step(k, splat, dx, dy, fall, block, here, mine, out, s, alphas, channels):
         up = UP + block * WIDTH
         lit = vec16(0.0)
         channel = int(0)
@@ -184,9 +183,8 @@ def make_adj_channels(mode: str, variant: BlendVariant, most: int = 0) -> wp.Ker
             else:
                 lit = fma(s[up + channel], mine[channel], lit)
             channel += 1
-        front, adj_front, w, part = pixel(
-            dx, dy, splat.root, splat.opacity, s[T + block], s[ADJ_T + block], alphas, here, s[WALKED + block], lit
-        )
+        t, adj_t, walked = s[T + block], s[ADJ_T + block], s[WALKED + block]
+        front, adj_front, w, part = pixel(dx, dy, fall, splat.root, splat.opacity, t, adj_t, alphas, here, walked, lit)
         s[T + block] = front
         s[ADJ_T + block] = adj_front
         for grad in range(CHANNEL):
@@ -242,7 +240,7 @@ def make_adj_channels(mode: str, variant: BlendVariant, most: int = 0) -> wp.Ker
             chosen = wp.array(ptr=s.ptr + wp.uint64(64 * RANK), shape=(LANES * WIDTH * BLOCKS,), dtype=float)
             into_lanes(ranks, 0, channels, tile, bins.tiles_x, chosen, WIDTH)
         length = steps[tile]
-        walk(bins, near, start, length, way, known, slots_out, begin, step, finish)
+        walk(bins, near, start, length, way, known, slots_out, fall_of, begin, step, finish)
         for k in range(start + steps[tile], bins.ranges[tile][1]):
             for grad in range(slots_out.shape[1]):
                 slots_out[k, grad] = 0.0
