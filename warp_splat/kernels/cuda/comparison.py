@@ -68,6 +68,15 @@ def lender(thread: int, tap: int):
     return wp.min(wp.max(thread + CHANNELS * (tap - RADIUS), 0), THREADS - 1)
 
 
+@wp.func
+def share_of(tile: int, thread: int, height: int, length: int):
+    """The rows of a block, from and to; the place in them of a thread's number, and whether it is compared here."""
+    strips = (length + STRIP - 1) // STRIP
+    top = (tile // strips) * BAND
+    place = (tile % strips) * STRIP + thread - HALO
+    return top, wp.min(top + BAND, height), place, thread >= HALO and thread < THREADS - HALO and place < length
+
+
 @wp.kernel
 def compare_block(
     pictures: PicturesView,
@@ -79,11 +88,7 @@ def compare_block(
     tile, thread = wp.tid()
     height = pictures.image.shape[0]
     length = pictures.image.shape[1]
-    strips = (length + STRIP - 1) // STRIP
-    top = (tile // strips) * BAND
-    bottom = wp.min(top + BAND, height)
-    place = (tile % strips) * STRIP + thread - HALO
-    compares = thread >= HALO and thread < THREADS - HALO and place < length
+    top, bottom, place, compares = share_of(tile, thread, height, length)
     p = pictures.centers[0]
     q = pictures.centers[1]
     missing = outside(place, CHANNELS, length)
@@ -133,11 +138,7 @@ def adj_compare_block(
     tile, thread = wp.tid()
     height = pictures.image.shape[0]
     length = pictures.image.shape[1]
-    strips = (length + STRIP - 1) // STRIP
-    top = (tile // strips) * BAND
-    bottom = wp.min(top + BAND, height)
-    place = (tile % strips) * STRIP + thread - HALO
-    compares = thread >= HALO and thread < THREADS - HALO and place < length
+    top, bottom, place, compares = share_of(tile, thread, height, length)
     p = pictures.centers[0]
     q = pictures.centers[1]
     ring = mat_slopes(0.0)
