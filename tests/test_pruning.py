@@ -287,6 +287,8 @@ def test_what_a_file_has_no_room_for_counts(folder, tmp_path, capsys, monkeypatc
     for promise in ("--max_loss", "--tolerance"):
         tried = ["simplify", tmp_path, promise, "0.001", "-o", output, "--device", "cpu"]
         assert "expected a format with room for harmonics" in fails(*tried)
+    tried = ["simplify", str(tmp_path), "--max_loss", "0.001", "--steps", "2", "-o", str(output), "--device", "cpu"]
+    assert main(tried) == 0 and "That is more than --max_loss" in capsys.readouterr().out
     save_gaussians(ply_path(tmp_path, 7), SplatFile(splats))  # whose harmonics are zeros
     assert main(["simplify", str(tmp_path), "--tolerance", "0.3", "-o", str(output), "--device", "cpu"]) == 0
     assert "all harmonics" not in capsys.readouterr().out

@@ -42,7 +42,7 @@ def clean(config: CleanConfig) -> int:
         parts = {*str(opened.trained.get("parts", "")).split(","), "floaters"}
         trained = {**opened.trained, "parts": ",".join(sorted(parts))}
         splats = tuned(opened.scene, left, opened.setting, len(splats.means), config.steps, trained)
-    code = write(output, opened, splats)
+    code, splats = write(output, opened, splats)
     opened.print_quality(before, splats)
     sheet = output.with_suffix(".sheet.png")
     _draw(opened, before, splats, sheet)

@@ -14,7 +14,7 @@ from warp_splat.camera import Camera
 from warp_splat.config import CleanConfig, FinishedModel, SimplifyConfig
 from warp_splat.errors import InputError
 from warp_splat.evaluation.metrics import psnr
-from warp_splat.formats.exchange import format_of, save_gaussians
+from warp_splat.formats.exchange import format_of, load_gaussians, save_gaussians
 from warp_splat.formats.files import save_somewhere
 from warp_splat.formats.model_folder import check_output, is_file_of_gaussians
 from warp_splat.formats.splats import SplatArrays, SplatFile, cropped, within
@@ -128,8 +128,12 @@ def written_bytes(name: Path, file: SplatFile) -> int:
         return sum(path.stat().st_size for path in Path(folder).iterdir())
 
 
-def write(path: Path, finished: Finished, splats: SplatArrays) -> int:
-    """Write ``splats`` in place of those of a model, and print what that saved, and lost; 1 if they are elsewhere."""
+def write(path: Path, finished: Finished, splats: SplatArrays) -> tuple[int, SplatArrays]:
+    """Write ``splats`` in place of those of a model, and print what that saved, and lost.
+
+    Returns:
+        1 if they are elsewhere, else 0; and the Gaussians as they are read again.
+    """
     before, notes = finished.placed(), finished.beyond_files
     after, size = before._replace(splats=splats), ""
     saved = save_somewhere(path, lambda place: save_gaussians(place, after, notes.append))
@@ -140,4 +144,4 @@ def write(path: Path, finished: Finished, splats: SplatArrays) -> int:
     print(f"{saved}: {len(splats.means)} of {len(before.splats.means)} Gaussians{size}")
     if notes:
         print(f"  lost: {'; '.join(dict.fromkeys(notes))}")
-    return int(saved != path)
+    return int(saved != path), load_gaussians(saved).splats

@@ -63,7 +63,8 @@ def simplify(config: SimplifyConfig) -> int:
         cameras = [view.camera for view in views]
         return largest_change(before, after, cameras, opened.setting.background, opened.setting.options)
 
-    if whole.sh[:, file.splats.sh.shape[1] :].any() and not config.steps:
+    lost = whole.sh[:, file.splats.sh.shape[1] :].any()
+    if lost and not config.steps:
         broken = config.tolerance and changed(file.splats)[1] > config.tolerance
         if broken or (config.max_loss and opened.psnr(file.splats, views) < enough):
             raise InputError(f"{output}: expected a format with room for harmonics; this loses more than allowed.")
@@ -74,13 +75,14 @@ def simplify(config: SimplifyConfig) -> int:
         _, count = _narrowed(0, total, lambda count: opened.psnr(made(count), views) < enough + spare)
     else:
         count = _count(config, output, file, thinning.to)
-    splats = file.splats if config.max_loss and count == total else made(count)  # no fewer keep it
+    # no fewer keep the promise
+    splats = file.splats if config.max_loss and count == total and not (lost and config.steps) else made(count)
     if not config.tolerance:
         splats = fewer_harmonics(opened, splats, enough if config.max_loss else None)
     if config.size and config.steps:  # trained numbers are harder to pack
         thinning = Thinning(splats, opened.setting)
         splats = thinning.to(_count(config, output, file._replace(splats=splats), thinning.to))
-    code = write(output, opened, splats)
+    code, held = write(output, opened, splats)
     if config.tolerance:
         measured, bound = changed(splats)
         found = f"{measured:.2g} measured, {upward(bound)} its bound"
@@ -89,7 +91,9 @@ def simplify(config: SimplifyConfig) -> int:
             print("  Without any change, the bound of rounding is more: nothing is left out; raise --tolerance.")
     numbers = np.bincount(degrees_of(splats))
     print(f"  harmonics: {', '.join(f'{number} of degree {degree}' for degree, number in enumerate(numbers))}")
-    opened.print_quality(whole, splats)
+    opened.print_quality(whole, held)
+    if config.max_loss and opened.psnr(held, views) < opened.psnr(whole, views) - config.max_loss - 5e-3:
+        print("  That is more than --max_loss, because of what the format rounds or has no room for: choose another.")
     print(f"  what each share costs: {output.with_suffix('.curve.png')}, .csv")
     return code
 
@@ -220,4 +224,4 @@ def _unseen(config: SimplifyConfig, output: Path) -> int:
     order = np.argsort(-sizes(file.splats), kind="stable")
     keep = lambda count: file.splats.take(np.sort(order[:count]))  # noqa: E731
     count = _count(config, output, file, keep)
-    return write(output, finished, keep(count))
+    return write(output, finished, keep(count))[0]
