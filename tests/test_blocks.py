@@ -145,16 +145,20 @@ def test_a_merge_says_what_is_wrong(found, trained, tmp_path, fails):
 
 
 def test_no_gaussians_are_merged_without_what_they_are_drawn_with(trained, tmp_path, fails, monkeypatch):
-    """Neither new ones nor, with what new ones are drawn with, those merged before."""
+    """Neither new ones nor, with what new ones are drawn with, those merged before, which a full disk leaves."""
     put(trained, tmp_path, 0, 1)
     monkeypatch.setattr("warp_splat.scene.blocks.write_coordinates", no_space)
     assert "no space left" in fails("merge", tmp_path)
     assert not list(tmp_path.glob("point_cloud/*/*"))
     monkeypatch.undo()
     assert main(["merge", str(tmp_path)]) == 0
-    monkeypatch.setattr("warp_splat.scene.blocks.save_gaussians", no_space)
-    assert "no space left" in fails("merge", tmp_path)
-    assert not list(tmp_path.glob("point_cloud/*/*"))
+    before = {path: path.read_bytes() for path in tmp_path.glob("*") if path.is_file()}
+    for writes, left in (("save_gaussians", 1), ("write_cfg_args", 0)):
+        with monkeypatch.context() as patch:
+            patch.setattr(f"warp_splat.scene.blocks.{writes}", no_space)
+            assert "no space left" in fails("merge", tmp_path)
+        assert len(list(tmp_path.glob("point_cloud/*/*"))) == left
+        assert all(path.read_bytes() == data for path, data in before.items())
 
 
 def test_blocks_are_not_trained_where_another_model_is(trained, tmp_path, fails):

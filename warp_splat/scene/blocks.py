@@ -26,7 +26,7 @@ BLOCK = "block.json"  # in the folder of a training that has ended
 SHARE = 0.1  # of what a photograph shows, for a block to train on it
 SOME = 1000  # points of a block that tell what a photograph shows
 ENDLESS = float(np.finfo(np.float32).max)  # where a cell has no neighbor; JSON has no infinity
-COMMON = ("antialiasing", "projection", "white_background", "eval")  # options of which a model has one
+COMMON = ("antialiasing", "projection", "white_background", "eval", "sh_degree")  # options of which a model has one
 
 
 class Block(NamedTuple):
@@ -148,12 +148,15 @@ def merge_blocks(config: MergeConfig) -> int:
         named = lambda entries: {str(entry["img_name"]): entry for entry in entries}  # noqa: E731
         cameras |= read_json(place / CAMERAS, "cameras as training writes them", named)
     merged = models[0][1]._replace(splats=arranged(concatenated(splats)), linear=False)  # cfg_args says it
+    fresh = folder / "merged.ply"
+    save_gaussians(fresh, merged)  # what was merged before goes when the disk had room for this
     save_points(folder / "input.ply", *map(np.concatenate, zip(*clouds, strict=True)))
     write_json(folder / CAMERAS, [{**cameras[name], "id": index} for index, name in enumerate(sorted(cameras))])
     write_coordinates(folder, read_coordinates(places[0]))
-    for old in folder.glob(AS_SAVED):  # merged before
+    for old in folder.glob(AS_SAVED):
         old.unlink()
     write_cfg_args(folder, {**trained[0], "block": "", "blocks": count, "model_path": str(folder)})
-    save_gaussians(path, merged)  # last: without the rest, they would be drawn otherwise
+    path.parent.mkdir(parents=True, exist_ok=True)
+    fresh.replace(path)  # last: without the rest, they would be drawn otherwise
     print(f"{path}: {len(merged.splats.means)} Gaussians of {count} blocks")
     return 0
