@@ -277,6 +277,11 @@ def trained(tmp_path_factory):
     return folder, file
 
 
+def test_formats_without_them_say_so(trained, tmp_path, capsys):
+    assert main(["convert", str(trained[0]), str(tmp_path / "a.ply")]) == 0
+    assert "how photographs were exposed (--parts exposure), which no format has" in capsys.readouterr().out
+
+
 def test_render_shows_photographs_as_they_were_taken(trained, capsys, monkeypatch):
     """By a gain on value + 0.055 in float64; and as the mean photograph where there is no file. A bound is before."""
     (folder, file), written = trained, []

@@ -63,6 +63,7 @@ class Finished:
     def beyond_files(self) -> list[str]:
         """What its pictures owe to the training, and no file of Gaussians says."""
         owed = {
+            "how photographs were exposed (--parts exposure)": bool(self.exposures),
             "what was learned behind the Gaussians (--parts sky)": self.harmonics is not None,
             "that a white background was behind them": bool(self.trained.get("white_background")),
             f"their projection ({self.options.projection})": self.options.projection != RasterOptions.projection,
