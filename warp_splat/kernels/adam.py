@@ -40,18 +40,15 @@ def make_adam(lanes: int, sparse: bool, halves: bool = False) -> wp.Kernel:
     def drawn(radii: wp.array[int], row: int, place: int, width: int):
         """Mask: the numbers from ``place`` on, counted from ``row``, are of Gaussians that are drawn."""
         shown = row + place // width
-        if wp.static(lanes == 1):
-            return wp.where(radii[shown] > 0, 1.0, 0.0)
-        else:
-            left = width - place % width  # numbers of this row
-            mask = number()
-            for lane in range(lanes):
-                if left == 0:
-                    shown += 1
-                    left = width
-                left -= 1
-                mask[lane] = wp.where(radii[shown] > 0, 1.0, 0.0)
-            return mask
+        left = width - place % width  # numbers of this row
+        mask = number()
+        for lane in range(lanes):
+            if left == 0:
+                shown += 1
+                left = width
+            left -= 1
+            mask[lane] = wp.where(radii[shown] > 0, 1.0, 0.0)
+        return mask
 
     @wp.kernel(module="unique", module_options=dict(FORWARD_ONLY))
     def adam(
@@ -85,7 +82,7 @@ def make_adam(lanes: int, sparse: bool, halves: bool = False) -> wp.Kernel:
             before = widened(firsts[i])
             before2 = widened(seconds[i])
             value, m, v = adam_step_of(values[i], grad, before, before2, numbers, table)
-            if wp.static(sparse):
+            if wp.static(sparse and lanes > 1):
                 if shown < lanes:
                     mask = drawn(radii, lanes * group, lanes * i, width)
                     m = pick(mask, m, before)

@@ -66,7 +66,7 @@ class ReverseStep(NamedTuple):
     """One Gaussian and one pixel, or sixteen, in a reverse loop.
 
     pixel(dx, dy, fall, root, opacity, t, adj_t, alphas, here, walked, lit):
-        fall: :func:`make_fall`'s answer. t: transmittance behind. adj_t: dL/dT behind, by hand times T. lit: what the
+        fall: the falloff there. t: transmittance behind. adj_t: dL/dT behind, by hand times T. lit: what the
         pixel's gradient says of the channels, color . u.
         -> T in front, that in front, the weight, and what to sum over pixels, in the columns before the channels'.
     geometry(sums, root, opacity):
@@ -75,18 +75,6 @@ class ReverseStep(NamedTuple):
 
     pixel: wp.Function
     geometry: wp.Function
-
-
-@once
-def make_fall(falloff: Falloff | int | None, number: type) -> wp.Function:
-    """The falloff at an offset from the mean [px], by the root of a Gaussian."""
-    fall_at = make_falloff(falloff).value
-
-    @func_of(number, root=wp.vec3)
-    def fall_of(dx, dy, root):
-        return fall_at(exponent(dx, dy, root[0], root[1], root[2]))
-
-    return fall_of
 
 
 @once

@@ -220,12 +220,9 @@ def join(device: str, images: int = 0, kind: type[Processes] = Processes) -> Ite
         # Else a thread of NCCL's ends the process when an exchange fails, and the model is lost. So the host waits for
         # each exchange, which raises: nothing is learned from a sum that never came, and who is left can save.
         os.environ.setdefault("TORCH_NCCL_BLOCKING_WAIT", "1")
-    try:
+    problem = f"Process {rank}: expected to meet {count - 1} others, as torchrun arranges"
+    with refusing((RuntimeError, ValueError), problem):
         dist.init_process_group(backend, timeout=PATIENCE)
-    except (RuntimeError, ValueError) as error:
-        raise InputError(
-            f"Process {rank}: expected to meet {count - 1} others, as torchrun arranges ({str(error).splitlines()[0]})."
-        ) from error
     try:
         with watching(rank, count, ends=kind.sharded) as watch:
             if images % count and not kind.sharded:

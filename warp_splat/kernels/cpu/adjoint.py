@@ -8,11 +8,12 @@ import warp as wp
 from warp_splat.config import TILE
 from warp_splat.kernels.compiler import FORWARD_ONLY, once
 from warp_splat.kernels.cpu.blend import AHEAD, BLOCKS, LANE_X, LANE_Y, ROWS_AHEAD, aligned, walk
+from warp_splat.kernels.falloff import make_falloff
 from warp_splat.kernels.inline import kernel_of_parts
 from warp_splat.kernels.simd import LANES, VECTORS, by_width, fma, times, total, vec16, where_less
 from warp_splat.kernels.slots import CHANNEL, OPACITY, write_geometry
 from warp_splat.kernels.splat import BlendVariant, Splat2D
-from warp_splat.kernels.step import make_fall, make_reverse_step
+from warp_splat.kernels.step import make_reverse_step
 from warp_splat.kernels.structs import BinsView, PixelsView
 
 vec8 = wp.types.vector(length=8, dtype=float)
@@ -130,7 +131,7 @@ def make_reverse(mode: str, variant: BlendVariant) -> wp.Kernel:
     mat_room = wp.types.matrix(shape=(SUMS + GRADS + ROWS_AHEAD + 1, LANES), dtype=float)
     vec_grads = wp.types.vector(length=GRADS, dtype=float)
     (pixel, geometry), way, known = make_reverse_step(mode, variant.falloff, vec16), -1, True
-    fall_of = make_fall(variant.falloff, vec16)
+    fall_at = make_falloff(variant.falloff).value
 
     def begin(k, here, out, s):
         for grad in range(GRADS):
@@ -196,6 +197,6 @@ def make_reverse(mode: str, variant: BlendVariant) -> wp.Kernel:
             for channel in range(CHANNELS):
                 s[UP + channel * BLOCKS + block] = up[tile, block * CHANNELS + channel]
         length = steps[tile]
-        walk(bins, near, start, length, way, known, slots_out, fall_of, begin, step, finish)
+        walk(bins, near, start, length, way, known, slots_out, fall_at, begin, step, finish)
 
     return adj_blend

@@ -38,10 +38,10 @@ from warp_splat.kernels.bound import BoundView, brightness, own_light, sure, uns
 from warp_splat.kernels.compiler import FORWARD_ONLY, once
 from warp_splat.kernels.cpu.ahead import ask
 from warp_splat.kernels.cpu.settle import SETTLED, make_settle, rows_from
+from warp_splat.kernels.falloff import make_falloff
 from warp_splat.kernels.inline import kernel_of_parts
 from warp_splat.kernels.simd import LANES, VECTORS, by_width, fma, lowest, times, total, vec16, where_less
-from warp_splat.kernels.splat import BlendVariant, Splat2D, advance, alpha_of, weight
-from warp_splat.kernels.step import make_fall
+from warp_splat.kernels.splat import BlendVariant, Splat2D, advance, alpha_of, exponent, weight
 from warp_splat.kernels.structs import BinsView, PixelsView
 from warp_splat.kernels.tiles import first_pixel_of
 
@@ -138,7 +138,7 @@ def corner(bins: BinsView, tile: int):
     return float(column) + 0.5, float(line) + 0.5
 
 
-def walk(bins, near, start, count, way, known, out, fall_of, begin, step, finish, tile):
+def walk(bins, near, start, count, way, known, out, fall_at, begin, step, finish, tile):
     """The loop over ``count`` instances of a list and the blocks that they reach, of which kernels put in the text.
 
     From ``start`` on, or (``way`` -1) towards it. Blocks are those of the Gaussian's box; or, ``known``, those in which
@@ -171,18 +171,15 @@ def walk(bins, near, start, count, way, known, out, fall_of, begin, step, finish
             block = lowest(left | NONE) & (BLOCKS - 1)
             dx = offset_x(splat.mean, x0, block & 3)
             dy = offset_y(splat.mean, y0, block >> 2)
-            fall = fall_of(dx, dy, splat.root)
+            fall = fall_at(exponent(dx, dy, splat.root[0], splat.root[1], splat.root[2]))
             while left != 0:
                 left &= left - 1
                 next_block = lowest(left | NONE) & (BLOCKS - 1)
                 next_dx = offset_x(splat.mean, x0, next_block & 3)
                 next_dy = offset_y(splat.mean, y0, next_block >> 2)
-                next_fall = fall_of(next_dx, next_dy, splat.root)
+                next_fall = fall_at(exponent(next_dx, next_dy, splat.root[0], splat.root[1], splat.root[2]))
                 step(k, splat, dx, dy, fall, block, here, own, out)
-                block = next_block
-                dx = next_dx
-                dy = next_dy
-                fall = next_fall
+                block, dx, dy, fall = next_block, next_dx, next_dy, next_fall
         else:
             box = boxes[ahead]
             by = box[2]
@@ -192,7 +189,7 @@ def walk(bins, near, start, count, way, known, out, fall_of, begin, step, finish
                 while bx <= box[1]:
                     block = (4 * by + bx) & (BLOCKS - 1)
                     dx = offset_x(splat.mean, x0, bx)
-                    fall = fall_of(dx, dy, splat.root)
+                    fall = fall_at(exponent(dx, dy, splat.root[0], splat.root[1], splat.root[2]))
                     step(k, splat, dx, dy, fall, block, here, own, out)
                     bx += 1
                 by += 1
@@ -209,7 +206,7 @@ def make_blend(variant: BlendVariant) -> wp.Kernel:
     IDEAL = SEEN + 1
     STATE = IDEAL + SETTLED * variant.bound
     mat_room = wp.types.matrix(shape=(STATE + ROWS_AHEAD + 1, LANES), dtype=float)
-    fall_of, way, known = make_fall(variant.falloff, vec16), 1, False
+    fall_at, way, known = make_falloff(variant.falloff).value, 1, False
     rows = rows_from(IDEAL, None if variant.ideal else RGB)
     prepare, expect, conclude = make_settle(RGB, rows, AHEAD)
     IDEAL_T, _, IDEAL_RGB, _, TOTAL, ADDED, *_ = rows
@@ -291,7 +288,7 @@ def make_blend(variant: BlendVariant) -> wp.Kernel:
         if wp.static(variant.bound):
             prepare(s)
         length = wp.min(bins.ranges[tile][1] - start, max_steps)
-        walk(bins, near, start, length, way, known, kept_out, fall_of, begin, step, finish)
+        walk(bins, near, start, length, way, known, kept_out, fall_at, begin, step, finish)
         if wp.static(variant.bound):
             conclude(s, bound, tile, bins, length, background)
         for block in range(BLOCKS):

@@ -11,11 +11,12 @@ from warp_splat.config import TILE
 from warp_splat.kernels.compiler import FORWARD_ONLY, once
 from warp_splat.kernels.cpu.adjoint import folded
 from warp_splat.kernels.cpu.blend import AHEAD, BLOCKS, ROWS_AHEAD, aligned, walk
+from warp_splat.kernels.falloff import make_falloff
 from warp_splat.kernels.inline import kernel_of_parts
 from warp_splat.kernels.simd import LANES, equal, fma, pick, times, vec16, where_less
 from warp_splat.kernels.slots import CHANNEL, OPACITY, write_geometry
 from warp_splat.kernels.splat import BlendVariant, Splat2D
-from warp_splat.kernels.step import make_fall, make_reverse_step, opaque
+from warp_splat.kernels.step import make_reverse_step, opaque
 from warp_splat.kernels.structs import BinsView
 
 AT_ONCE = 32  # channels
@@ -62,7 +63,7 @@ def make_beside(variant: BlendVariant, most: int | None = None) -> wp.Kernel:
     With ``most``, instead the weights of so many strongest Gaussians, their places in the tile's list, and that of the
     Gaussian at which half of the light is gone.
     """
-    fall_of, way, known, WIDTH, MOST = make_fall(variant.falloff, vec16), 1, True, AT_ONCE, most or 0
+    fall_at, way, known, WIDTH, MOST = make_falloff(variant.falloff).value, 1, True, AT_ONCE, most or 0
     T, WALKED, SUMS, MEDIAN, WEIGHT, RANK = (place * BLOCKS for place in (0, 1, 2, 2, 3, 3 + MOST))
     STATE = RANK + MOST * BLOCKS if most is not None else SUMS + WIDTH * BLOCKS
     mat_room = wp.types.matrix(shape=(STATE + ROWS_AHEAD + 1, LANES), dtype=float)
@@ -127,7 +128,7 @@ def make_beside(variant: BlendVariant, most: int | None = None) -> wp.Kernel:
             for j in range(MOST):
                 s[RANK + j * BLOCKS + block] = vec16(-1.0)
         length = steps[tile]
-        walk(bins, near, start, length, way, known, pixels_out, fall_of, begin, step, finish)
+        walk(bins, near, start, length, way, known, pixels_out, fall_at, begin, step, finish)
         numbers = wp.array(ptr=s.ptr + wp.uint64(64 * SUMS), shape=((STATE - SUMS) * LANES,), dtype=float)
         pixel = int(0)
         while pixel < TILE * TILE:
@@ -157,7 +158,7 @@ def make_adj_channels(mode: str, variant: BlendVariant, most: int = 0) -> wp.Ker
     ``most``, instead that of the weights of so many of a pixel's Gaussians, which have no channels.
     """
     (pixel, geometry), way, known = make_reverse_step(mode, variant.falloff, vec16), -1, True
-    fall_of = make_fall(variant.falloff, vec16)
+    fall_at = make_falloff(variant.falloff).value
     WIDTH = most or AT_ONCE  # of a block's numbers
     geometric = bool(most) or mode == "absolute"  # channels have no gradients of their own
     T, ADJ_T, WALKED, UP = 0, BLOCKS, 2 * BLOCKS, 3 * BLOCKS
@@ -240,7 +241,7 @@ def make_adj_channels(mode: str, variant: BlendVariant, most: int = 0) -> wp.Ker
             chosen = wp.array(ptr=s.ptr + wp.uint64(64 * RANK), shape=(LANES * WIDTH * BLOCKS,), dtype=float)
             into_lanes(ranks, 0, channels, tile, bins.tiles_x, chosen, WIDTH)
         length = steps[tile]
-        walk(bins, near, start, length, way, known, slots_out, fall_of, begin, step, finish)
+        walk(bins, near, start, length, way, known, slots_out, fall_at, begin, step, finish)
         for k in range(start + steps[tile], bins.ranges[tile][1]):
             for grad in range(slots_out.shape[1]):
                 slots_out[k, grad] = 0.0

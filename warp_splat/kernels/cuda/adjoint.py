@@ -24,8 +24,8 @@ from warp_splat.kernels.cuda import warps
 from warp_splat.kernels.cuda.blend import BLOCK_OPTIONS, THREADS, staged_of
 from warp_splat.kernels.falloff import LOG2_E, make_falloff
 from warp_splat.kernels.slots import CHANNEL, MEAN_X, MEAN_Y, OPACITY, XX, XY, YY
-from warp_splat.kernels.splat import BlendVariant
-from warp_splat.kernels.step import make_fall, make_reverse_step
+from warp_splat.kernels.splat import BlendVariant, exponent
+from warp_splat.kernels.step import make_reverse_step
 from warp_splat.kernels.structs import BinsView, PixelsView
 
 
@@ -114,7 +114,7 @@ def make_reverse(mode: str, variant: BlendVariant) -> wp.Kernel:
     CHANNELS, GRADS = variant.channels, variant.columns
     reach_of = make_falloff(variant.falloff).reach_of
     pixel, geometry = make_reverse_step(mode, variant.falloff, float)
-    fall_of = make_fall(variant.falloff, float)
+    fall_at = make_falloff(variant.falloff).value
 
     @wp.kernel(module="unique", module_options=dict(warps.WARP_OPTIONS))
     def adj_blend(
@@ -171,7 +171,7 @@ def make_reverse(mode: str, variant: BlendVariant) -> wp.Kernel:
                         lit = ups[0, p] * g[CHANNEL] + ups[1, p] * g[CHANNEL + 1] + ups[2, p] * g[CHANNEL + 2]
                         if wp.static(CHANNELS > 3):
                             lit += ups[3, p] * g[CHANNEL + 3]
-                        fall = fall_of(dx, dy, root)
+                        fall = fall_at(exponent(dx, dy, root[0], root[1], root[2]))
                         front, adj_front, w, part = pixel(
                             dx, dy, fall, root, g[OPACITY], ts[p], adj_ts[p], alphas, here, walked[p], lit
                         )

@@ -14,7 +14,7 @@ from warp_splat.kernels.falloff import make_falloff
 from warp_splat.kernels.simd import fma
 from warp_splat.kernels.slots import CHANNEL, MEAN_X, MEAN_Y, OPACITY, XX, XY, YY
 from warp_splat.kernels.splat import BlendVariant, exponent
-from warp_splat.kernels.step import make_fall, make_reverse_step, opaque
+from warp_splat.kernels.step import make_reverse_step, opaque
 from warp_splat.kernels.structs import BinsView
 from warp_splat.kernels.tiles import first_pixel_of
 
@@ -110,7 +110,7 @@ def make_adj_channels(mode: str, variant: BlendVariant, most: int = 0) -> wp.Ker
     WIDTH = most or AT_ONCE
     geometric = bool(most) or mode == "absolute"  # channels have no gradients of their own
     pixel, geometry = make_reverse_step(mode, variant.falloff, float)
-    fall_of = make_fall(variant.falloff, float)
+    fall_at = make_falloff(variant.falloff).value
     vec_up = wp.types.vector(length=WIDTH, dtype=float)
 
     @wp.kernel(module="unique", module_options=dict(BLOCK_OPTIONS))
@@ -161,7 +161,7 @@ def make_adj_channels(mode: str, variant: BlendVariant, most: int = 0) -> wp.Ker
                 else:
                     lit += up[channel] * rows[splat, channel]
             root = wp.vec3(g[XX], g[XY], g[YY])
-            fall = fall_of(dx, dy, root)
+            fall = fall_at(exponent(dx, dy, root[0], root[1], root[2]))
             front, adj_front, w, part = pixel(dx, dy, fall, root, g[OPACITY], t, adj_t, alphas, here, walked, lit)
             t = front
             adj_t = adj_front
