@@ -1,6 +1,5 @@
 """Photographs within a bound of memory: the same bytes of the model as with all of them in memory."""
 
-import json
 from collections import Counter
 from types import SimpleNamespace
 
@@ -153,6 +152,3 @@ def test_a_held_out_photograph_that_breaks_off_loses_no_step(tmp_path, capsys):
     broken.write_bytes(whole)
     assert main(["train", "--resume", str(model)]) == 0 == train(tmp_path / "again", *options)
     assert ply_path(model, 12).read_bytes() == ply_path(tmp_path / "again", 12).read_bytes()
-    found, expected = (json.loads((place / "history.json").read_text()) for place in (model, tmp_path / "again"))
-    assert [record["iteration"] for record in found] == [5, 12]
-    assert [record["loss"] for record in found] == [record["loss"] for record in expected]

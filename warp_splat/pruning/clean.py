@@ -42,12 +42,12 @@ def clean(config: CleanConfig) -> int:
         parts = {*str(opened.trained.get("parts", "")).split(","), "floaters"}
         trained = {**opened.trained, "parts": ",".join(sorted(parts))}
         splats = tuned(opened.scene, left, opened.setting, len(splats.means), config.steps, trained)
-    code, splats = write(output, opened, splats)
-    opened.print_quality(before, splats)
+    saved = write(output, opened, splats)
+    opened.print_quality(before, saved)
     sheet = output.with_suffix(".sheet.png")
     _draw(opened, before, splats, sheet)
     print(f"  the views that changed most, before and after: {sheet}")
-    return code
+    return int(saved != output)
 
 
 def floaters(splats: SplatArrays, setting: ViewSetting, views: float, near: float) -> np.ndarray:

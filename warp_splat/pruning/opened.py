@@ -75,12 +75,15 @@ class Opened(Finished):
         picture = self.picture_of(splats)
         return float(np.mean([min(psnr(picture(v.camera, v.name), v.picture, v.mask), 99.0) for v in views]))
 
-    def print_quality(self, before: SplatArrays, after: SplatArrays) -> None:
-        """A line for the training views and, if there are any, for those held out."""
+    def print_quality(self, before: SplatArrays, path: Path) -> float:
+        """A line for the training views and, if there are any, for those held out, of a file; the former's PSNR."""
+        after, found = load_gaussians(path).splats, []
         for name, views in {"train": self.scene.train, "test": self.scene.test}.items():
             if views:
                 old, new = (self.psnr(splats, views) for splats in (before, after))
                 print(f"  {name} PSNR {old:.2f} -> {new:.2f} dB ({new - old:+.2f})")
+                found.append(new)
+        return found[0]
 
 
 def within_sight(views: list[View], shows: Callable[[Camera], torch.Tensor]) -> list[View]:
@@ -128,12 +131,8 @@ def written_bytes(name: Path, file: SplatFile) -> int:
         return sum(path.stat().st_size for path in Path(folder).iterdir())
 
 
-def write(path: Path, finished: Finished, splats: SplatArrays) -> tuple[int, SplatArrays]:
-    """Write ``splats`` in place of those of a model, and print what that saved, and lost.
-
-    Returns:
-        1 if they are elsewhere, else 0; and the Gaussians as they are read again.
-    """
+def write(path: Path, finished: Finished, splats: SplatArrays) -> Path:
+    """Write ``splats`` in place of those of a model, and print what that saved, and lost; returns where they are."""
     before, notes = finished.placed(), finished.beyond_files
     after, size = before._replace(splats=splats), ""
     saved = save_somewhere(path, lambda place: save_gaussians(place, after, notes.append))
@@ -144,4 +143,4 @@ def write(path: Path, finished: Finished, splats: SplatArrays) -> tuple[int, Spl
     print(f"{saved}: {len(splats.means)} of {len(before.splats.means)} Gaussians{size}")
     if notes:
         print(f"  lost: {'; '.join(dict.fromkeys(notes))}")
-    return int(saved != path), load_gaussians(saved).splats
+    return saved

@@ -82,7 +82,7 @@ def simplify(config: SimplifyConfig) -> int:
     if config.size and config.steps:  # trained numbers are harder to pack
         thinning = Thinning(splats, opened.setting)
         splats = thinning.to(_count(config, output, file._replace(splats=splats), thinning.to))
-    code, held = write(output, opened, splats)
+    saved = write(output, opened, splats)
     if config.tolerance:
         measured, bound = changed(splats)
         found = f"{measured:.2g} measured, {upward(bound)} its bound"
@@ -91,11 +91,10 @@ def simplify(config: SimplifyConfig) -> int:
             print("  Without any change, the bound of rounding is more: nothing is left out; raise --tolerance.")
     numbers = np.bincount(degrees_of(splats))
     print(f"  harmonics: {', '.join(f'{number} of degree {degree}' for degree, number in enumerate(numbers))}")
-    opened.print_quality(whole, held)
-    if config.max_loss and opened.psnr(held, views) < opened.psnr(whole, views) - config.max_loss - 5e-3:
+    if opened.print_quality(whole, saved) < enough - 5e-3:  # which two digits do not show
         print("  That is more than --max_loss, because of what the format rounds or has no room for: choose another.")
     print(f"  what each share costs: {output.with_suffix('.curve.png')}, .csv")
-    return code
+    return int(saved != output)
 
 
 def fewer_harmonics(opened: Opened, splats: SplatArrays, least: float | None = None) -> SplatArrays:
@@ -224,4 +223,4 @@ def _unseen(config: SimplifyConfig, output: Path) -> int:
     order = np.argsort(-sizes(file.splats), kind="stable")
     keep = lambda count: file.splats.take(np.sort(order[:count]))  # noqa: E731
     count = _count(config, output, file, keep)
-    return write(output, finished, keep(count))[0]
+    return int(write(output, finished, keep(count)) != output)

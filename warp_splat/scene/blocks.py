@@ -148,15 +148,12 @@ def merge_blocks(config: MergeConfig) -> int:
         named = lambda entries: {str(entry["img_name"]): entry for entry in entries}  # noqa: E731
         cameras |= read_json(place / CAMERAS, "cameras as training writes them", named)
     merged = models[0][1]._replace(splats=arranged(concatenated(splats)), linear=False)  # cfg_args says it
-    fresh = folder / "merged.ply"
-    save_gaussians(fresh, merged)  # what was merged before goes when the disk had room for this
     save_points(folder / "input.ply", *map(np.concatenate, zip(*clouds, strict=True)))
     write_json(folder / CAMERAS, [{**cameras[name], "id": index} for index, name in enumerate(sorted(cameras))])
     write_coordinates(folder, read_coordinates(places[0]))
-    for old in folder.glob(AS_SAVED):
+    for old in folder.glob(AS_SAVED):  # merged before
         old.unlink()
     write_cfg_args(folder, {**trained[0], "block": "", "blocks": count, "model_path": str(folder)})
-    path.parent.mkdir(parents=True, exist_ok=True)
-    fresh.replace(path)  # last: without the rest, they would be drawn otherwise
+    save_gaussians(path, merged)  # last: without the rest, they would be drawn otherwise
     print(f"{path}: {len(merged.splats.means)} Gaussians of {count} blocks")
     return 0

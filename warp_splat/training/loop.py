@@ -36,9 +36,7 @@ def train_steps(trainer: Trainer, run: Run, interrupted: list[int], viewer: "Tra
     unprofiled = None  # iteration and seconds before the last --profile steps
     trainer.check_identical(run.iteration)
     with _progress_bar(trainer, run) as bar, timers.profile(report.profile > 0) as stages:
-        # what was due when this checkpoint was kept, because a photograph could not be read
-        stop = bool(run.losses) and _do_what_is_due(trainer, run, interrupted, bar)
-        while not stop and run.iteration < trainer.config.learn.end:
+        while run.iteration < trainer.config.learn.end:
             iteration = run.iteration + processes.images
             if unprofiled is None and iteration > trainer.config.learn.end - report.profile:
                 stages.clear()

@@ -45,7 +45,7 @@ def folded_eight(rows: wp.array[vec16], row: int) -> vec8:
 
 @wp.func_native(by_width("", "__atomic_signal_fence(__ATOMIC_ACQ_REL);"))
 def forget():
-    """What was read of memory is read anew: of too few registers, LLVM would store the sums twice to carry them on."""
+    """What follows reads memory anew. To carry the sums on, LLVM would store them twice for want of registers."""
 
 
 @once

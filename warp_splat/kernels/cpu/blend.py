@@ -142,10 +142,10 @@ def walk(bins, near, start, count, way, known, out, fall_at, begin, step, finish
     """The loop over ``count`` instances of a list and the blocks that they reach, of which kernels put in the text.
 
     From ``start`` on, or (``way`` -1) towards it. Blocks are those of the Gaussian's box; or, ``known``, those in which
-    the blend saw it, a fifth to a third fewer, which it has left in ``bins``. There the falloff is found a block ahead,
-    so that one waits for its results while another is under way. ``near`` has room for AHEAD splats. Parts of the
-    kernel, for which ``out`` is: ``begin`` with a splat, its answer goes to ``step`` with a block; ``finish`` says
-    whether to stop there.
+    the blend saw it, a fifth to a third fewer, which it has left in ``bins``. There the falloff, ``fall_at``, is
+    found a block ahead: the processor works on one block while it waits for results of another. ``near`` has room for
+    AHEAD splats. Parts of the kernel, for which ``out`` is: ``begin`` with a splat, its answer goes to ``step`` with a
+    block; ``finish`` says whether to stop there.
     """
     boxes = mat_boxes()
     x0, y0 = corner(bins, tile)
