@@ -83,6 +83,8 @@ def test_what_hides_is_checked():
         (RasterOptions(hidden_from=surface[1:]), r"options.hidden_from: expected shape \[24, 40\], got \[23, 40\]"),
         (RasterOptions(hidden_from=surface, bound=True), "neither bound nor tolerance"),
         (replace(RasterOptions(hidden_from=surface), tolerance=0.1), "neither bound nor tolerance"),
+        (RasterOptions(tolerance=-1.0), "options.tolerance: expected numbers above 0"),
     ):
-        with pytest.raises(InputError, match=sentence):
-            warp_splat.rasterize(*three(), CAMERA, options=options)
+        for call in (warp_splat.rasterize, warp_splat.check_gradients):
+            with pytest.raises(InputError, match=sentence):
+                call(*three(), CAMERA, options=options)

@@ -136,7 +136,9 @@ def check_gradients(
     names = differences.inputs_of(camera) if parameters is None else tuple(parameters)
     gaussians = checks.check_gaussians(means, quats, scales, opacities, sh)
     background = checks.check_background(background, means.device)
-    with checks.explained(options, means, [checks.check_camera(camera)]):
+    checks.check_tolerance(options)
+    checks.check_hidden_from(options, base := checks.check_camera(camera), means.device)
+    with checks.explained(options, means, [base]):
         scene = MovableScene(gaussians, background, camera, options, adjoint, int(seed))
     if options.falloff:
         _check_falloff(options.falloff, means.device)
