@@ -12,8 +12,8 @@ KERNELS = ROOT / "warp_splat" / "kernels"
 _CLAMP = ("splat.adj_alpha_of",)
 _EXP = ("falloff.adj_exp2_known", "step.adj_opaque", *_CLAMP)
 _ROOT = ("step.conic_from_root",)
-_READ = ("cpu/taped.adj_spread", "cpu/taped.adj_collect", "falloff.adj_fall_value", *_ROOT)
-_BEGIN = ("cpu/taped.replay_begin", "cpu/taped.adj_begin")
+_READ = ("cpu/taped.adj_spread", "cpu/taped.adj_collect", *_ROOT)
+_BEGIN = ("cpu/taped.replay_begin",)
 _KEPT = ("cpu/taped.replay_front_of", "cpu/taped.adj_front_of")
 _UNDO = (*_KEPT, "splat.odds_of")
 
