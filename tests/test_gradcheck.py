@@ -22,7 +22,7 @@ VARIANTS = [
     ("opaque", RasterOptions(depth=True, antialiasing=True, projection="ellipsoid")),
     ("far_world", RasterOptions(alpha_min=0.0, t_min=0.0)),
     ("dense_tile", RasterOptions(depth=True, extent="square")),
-    ("size_1x1", RasterOptions()),
+    ("size_1x1", RasterOptions(bound=True)),
 ]
 
 

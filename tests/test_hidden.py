@@ -84,6 +84,8 @@ def test_what_hides_is_checked():
         (RasterOptions(hidden_from=surface, bound=True), "neither bound nor tolerance"),
         (replace(RasterOptions(hidden_from=surface), tolerance=0.1), "neither bound nor tolerance"),
         (RasterOptions(tolerance=-1.0), "options.tolerance: expected numbers above 0"),
+        (RasterOptions(tolerance=surface.to_sparse()), "options.tolerance: expected a dense tensor"),
+        (RasterOptions(tolerance=surface.to("meta")), "options.tolerance: expected a tensor on the CPU"),
     ):
         for call in (warp_splat.rasterize, warp_splat.check_gradients):
             with pytest.raises(InputError, match=sentence):

@@ -119,8 +119,9 @@ def check_tolerance(options: RasterOptions, features: object = None) -> None:
     """Raise InputError if the tolerance is no positive number, or if it asks for what only a single pass gives."""
     if (tolerance := options.tolerance) is None:
         return
-    real = isinstance(tolerance, numbers.Real) or (isinstance(tolerance, torch.Tensor) and not tolerance.is_complex())
-    if not real or isinstance(tolerance, bool):
+    if isinstance(tolerance, torch.Tensor) and not tolerance.is_complex():
+        _check_place("options.tolerance", tolerance, None)
+    elif isinstance(tolerance, bool) or not isinstance(tolerance, numbers.Real):
         raise InputError(f"options.tolerance: expected a number or a tensor [H, W], got {type(tolerance).__name__}.")
     if not bool(torch.as_tensor(tolerance > 0.0).all()):  # pyright: ignore[reportOperatorIssue]
         raise InputError(f"options.tolerance: expected numbers above 0, got {tolerance!r:.60}.")
@@ -182,15 +183,15 @@ def check_tensor(name: str, tensor, shape: tuple[int | str, ...], device: torch.
         raise InputError(
             f"{name}: expected float32, got {str(tensor.dtype).removeprefix('torch.')}; convert it with .float()."
         )
-    if tensor.device.type not in DRIVERS:
-        raise InputError(
-            f"{name}: expected a tensor on the CPU or an NVIDIA GPU, got one on {tensor.device}; move it with .cpu()."
-        )
     _check_place(name, tensor, device)
 
 
 def _check_place(name: str, tensor: torch.Tensor, device: torch.device | None) -> None:
-    """Raise InputError if ``tensor`` is sparse, or on another device than a given one."""
+    """Raise InputError if ``tensor`` is sparse, without a driver, or on another device than a given one."""
+    if tensor.device.type not in DRIVERS:
+        raise InputError(
+            f"{name}: expected a tensor on the CPU or an NVIDIA GPU, got one on {tensor.device}; move it with .cpu()."
+        )
     if tensor.layout != torch.strided:
         raise InputError(f"{name}: expected a dense tensor, got one that is sparse; convert it with .to_dense().")
     if device is not None and tensor.device != device:

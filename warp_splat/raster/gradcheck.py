@@ -5,7 +5,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from numbers import Integral
 
 import torch
@@ -116,7 +116,7 @@ def check_gradients(
             coefficients of a lens "coefficients".
         background: RGB.
         adjoint: the mode to check; also "generated" and "plain" (known to be wrong), which are there to be compared.
-        options: what to compute; with ``depth``, it is part of the loss.
+        options: what to compute, without its bound; with ``depth``, it is part of the loss.
         parameters: names of what to check; None: "means", "quats", "scales", "opacities", "sh" and "background". Also
             "means2d", "conics", "opacities2d", "colors" and "depths", which lie on the way to the image: their
             differences see binning and blend alone.
@@ -139,7 +139,7 @@ def check_gradients(
     checks.check_tolerance(options)
     checks.check_hidden_from(options, base := checks.check_camera(camera), means.device)
     with checks.explained(options, means, [base]):
-        scene = MovableScene(gaussians, background, camera, options, adjoint, int(seed))
+        scene = MovableScene(gaussians, background, camera, replace(options, bound=False), adjoint, int(seed))
     if options.falloff:
         _check_falloff(options.falloff, means.device)
     checks.explain_invalid(scene.out.invalid, quats)
