@@ -92,7 +92,7 @@ def walk(count: int) -> list[dict]:
     size = np.linalg.norm(grads)
     where, condition = f"{count} layers", np.linalg.norm(here + after) / size
     recovered = np.abs(found / truth[:-1] - 1.0).max()
-    rows = [{"what": "T, back at the front", "where": where, "measured": recovered}]
+    rows = [{"what": "T, worst layer", "where": where, "measured": recovered}]
     rows[0] |= {"root": 3.0 * EPS * squares.max(), "bound": EPS * roundings.max(), "condition": 1.0}
     for name, got in (("forward pass alone", of_forward), ("adjoint alone", of_adjoint), ("both", both)):
         row = {"what": f"gradient, rounded: {name}", "where": where, "measured": np.linalg.norm(got - grads) / size}

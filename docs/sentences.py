@@ -9,6 +9,8 @@ import re
 
 import figures as f
 
+POSES = "--parts pose", "--parts pose --pose_intrinsics focal"
+
 
 def _scaling() -> list[tuple]:
     records = f.data("blocks")["records"]
@@ -88,7 +90,7 @@ def _adjoints() -> list[tuple]:
     finer, finest = (f.knob(f.EMBEDDED, f"alpha_min {value}") for value in ("0.001", "0.0001"))
     long = f.quoted("compare/compare.txt", r"embedded, step 300 \| central differences .*\| ([\d.e+]+) extrapolated")[0]
     return [
-        ("Machine of all figures: {}.\n", f.compared_on()),
+        ("Machine of error and run\ntime: {}. Other", f.compared_on()),
         (
             "545 px, {} million tile",
             f.two(int(f.quoted("benchmarks/adjoints.md", r"(\d+) tile instances")[0]) / 1e6),
@@ -357,6 +359,24 @@ def _cuda() -> list[tuple]:
     ]
 
 
+def _captures() -> list[tuple]:
+    runs = f.data("poses")["runs"]
+    (best, *_), posed, focal = (runs[f"right, {more}"] for more in ("none", *POSES))
+    (worst, *_), posed_back, focal_back = (runs[f"wrong, {more}"] for more in ("none", *POSES))
+    shares = [f"{100 * (psnr - worst) / (best - worst):.0f}" for psnr, *_ in (focal_back, posed_back)]
+    return [
+        (
+            "\n- {} % of what the faults cost comes back ({} of {} dB), and {} % with the poses alone",
+            *(shares[0], f.two(focal_back[0] - worst), f.two(best - worst), shares[1]),
+        ),
+        (
+            "`pose` costs {} dB, and with `--pose_intrinsics focal` {} dB",
+            *(f.two(best - psnr) for psnr, *_ in (posed, focal)),
+        ),
+        ("\n- {} % of the focal length's fault", f"{100 - 1e4 * focal_back[4]:.0f}"),
+    ]
+
+
 #: By page: pieces of its text, with ``{}`` for a figure, and the figures.
 SENTENCES = {
     "scaling.md": _scaling,
@@ -370,6 +390,7 @@ SENTENCES = {
     "simulation.md": _simulation,
     "cameras.md": _cameras,
     "cuda.md": _cuda,
+    "captures.md": _captures,
 }
 
 
