@@ -14,7 +14,7 @@ from warp_splat import Camera, CameraParameters, RasterOptions, rasterize
 from warp_splat.kernels.formula import Notes, Number
 from warp_splat.kernels.project import affine
 from warp_splat.lenses import Lens
-from warp_splat.lenses.formulas import MODELS, PINHOLE
+from warp_splat.lenses.formulas import MODELS, PINHOLE, Family
 from warp_splat.raster.data import Gaussians
 from warp_splat.raster.drivers import CPU
 from warp_splat.raster.project import project
@@ -245,3 +245,52 @@ def test_one_at_a_time_as_on_a_gpu_is_the_same(name, projection):
         found.append([*splats[:6], *torch.autograd.grad(splats[:5], given, upstream)])
     for sixteen, one in zip(*found, strict=True):
         torch.testing.assert_close(sixteen, one, rtol=5e-5, atol=1e-5 * max(float(one.detach().abs().max()), 1e-9))
+
+
+def folding(k, x, y, z):
+    u, v = x / z, y / z
+    shrunk = 1 + k[0] * (u * u + v * v)
+    return u * shrunk, v * shrunk
+
+
+def own_camera(monkeypatch, formula, coefficient=0.1):
+    monkeypatch.setitem(MODELS, "OWN", (Family(formula, count=1, wide=False), 1))
+    return Camera(96, 64, 60.0, 60.0, 48.0, 32.0, np.eye(3), np.zeros(3), lens=Lens("OWN", (coefficient,)))
+
+
+def test_a_name_may_get_another_formula(monkeypatch):
+    reach = own_camera(monkeypatch, lambda k, x, y, z: (x / z, y / z)).reach
+    assert own_camera(monkeypatch, folding).reach < reach - 0.01
+    own_camera(monkeypatch, lambda k, x, y, z: (x / z, y / z), -0.9)
+    refusal(lambda: own_camera(monkeypatch, folding, -0.9), match="fold it")
+
+
+@pytest.mark.parametrize(
+    ("message", "scale"),
+    [
+        ("found one by if, and, or", lambda k, _: 2.0 if k[0] > 0 else 1.0),
+        ("found one by if, and, or", lambda k, _: max(k[0], 0.5)),
+        ("found less_equal", lambda k, r: np.where(r <= 0.1, 1.0, 1 + k[0] * r)),
+        ("found multiply with out", lambda k, r: np.multiply(k[0], r, out=r if isinstance(r, np.ndarray) else (r,))),
+    ],
+)
+def test_what_a_formula_cannot_be_is_refused(monkeypatch, message, scale):
+    def formula(k, x, y, z):
+        s = scale(k, (x * x + y * y) / (z * z))
+        return x / z * s, y / z * s
+
+    scene = scenes.SCENES["degree1"]()
+    camera = own_camera(monkeypatch, formula)
+    refusal(lambda: rasterize(*scene.parameters(), camera), match=message)
+
+
+def test_a_choice_counts_as_true_what_is_not_zero(monkeypatch, device):
+    def formula(k, x, y, z):
+        return np.where(x, 0.5, 1.0) * np.where(0 * k[0], 0.0, x / z), np.where(k[0], 1.0, 0.5) * y / z
+
+    means = torch.tensor([[-0.5, 0.2, 2.0], [0.5, -0.4, 2.0]], device=device)
+    quats, scales = torch.eye(4, device=device)[:1].expand(2, 4), torch.full((2, 3), 0.05, device=device)
+    opacities, sh = torch.full((2,), 0.7, device=device), torch.zeros(2, 1, 3, device=device)
+    out = rasterize(means, quats, scales, opacities, sh, own_camera(monkeypatch, formula, -0.1))
+    wanted = torch.tensor([[48 - 7.5, 32 + 6.0], [48 + 7.5, 32 - 12.0]])
+    torch.testing.assert_close(out.means2d.cpu(), wanted, rtol=0, atol=1e-4)

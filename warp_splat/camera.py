@@ -86,7 +86,7 @@ class Camera:
             if not isinstance(part := getattr(self, name), kind | None):
                 raise InputError(f"Camera {name}: expected a warp_splat.{kind.__name__} or None, got {part!r:.80}.")
         if self.lens is not None:
-            check_picture(self.lens, *self._picture)
+            check_picture(self.lens, self.lens.family, *self._picture)
             if self.lens.family.around and abs(self.width - 2 * self.height) > ODD:
                 raise InputError(
                     f"Camera lens {self.lens.model}: expected a picture of 2:1, got {self.width} x {self.height} "
@@ -147,9 +147,9 @@ class Camera:
     @property
     def reach(self) -> float:
         """The largest angle between the axis and what a pixel sees [rad]."""
-        left, top, right, bottom = self._picture
         if self.lens:
-            return angle_of_view(self.lens, left, top, right, bottom)
+            return angle_of_view(self.lens, self.lens.family, *self._picture)
+        left, top, right, bottom = self._picture
         return math.atan(math.hypot(max(-left, right), max(-top, bottom)))
 
     def pixels(self, rays: np.ndarray) -> np.ndarray:

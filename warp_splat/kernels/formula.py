@@ -14,6 +14,7 @@ from functools import partial
 import numpy as np
 import warp as wp
 
+from warp_splat.errors import InputError
 from warp_splat.kernels import simd
 from warp_splat.kernels.angle import angle
 from warp_splat.kernels.inline import defined
@@ -59,9 +60,11 @@ class Notes:
         """Likewise."""
         return self.note("minus", a, b) if a and b else a or (b and self.note("negative", b))
 
-    def chosen(self, mask: str, a: Name, b: Name) -> Name:
-        """``a`` where the mask is set, else ``b``."""
-        return self.note("pick", mask, self.real(a), self.real(b)) if a or b else None
+    def chosen(self, mask: Name, a: Name, b: Name) -> Name:
+        """``a`` where the mask is not zero, else ``b``."""
+        if ("less", mask) not in ((step[0], name) for step, name in self.steps.items()):
+            mask = self.product(mask, mask)  # above zero, also of negative numbers
+        return self.note("pick", self.real(mask), self.real(a), self.real(b)) if a or b else None
 
     def real(self, a: Name) -> str:
         """The name of a number that may be zero."""
@@ -102,13 +105,17 @@ class Number(np.lib.mixins.NDArrayOperatorsMixin):
     def __init__(self, notes: Notes, name: Name, slopes: tuple[Name, ...] = ()):
         self.notes, self.name, self.slopes = notes, name, slopes
 
-    def __array_ufunc__(self, function: Callable, method: str, *operands):
-        if method != "__call__" or function not in RULES:
-            raise NotImplementedError(f"{function}: no rule for it; see warp_splat/kernels/formula.py")
+    def __array_ufunc__(self, function: Callable, method: str, *operands, **more):
+        if method != "__call__" or more or function not in RULES:
+            found = " with ".join([function.__name__, *more])
+            raise InputError(f"lens formula: expected only what docs/extending.md names, found {found}.")
         return RULES[function](self.notes, *_aligned(self.notes, operands))
 
     def __array_function__(self, function: Callable, _types, operands, _keywords):
         return self.__array_ufunc__(function, "__call__", *operands)
+
+    def __bool__(self) -> bool:
+        raise InputError("lens formula: expected choices by np.where, found one by if, and, or, not, min or max.")
 
 
 def _aligned(notes: Notes, operands: Sequence) -> list[Number]:

@@ -134,8 +134,11 @@ def _ray(bent: np.ndarray) -> np.ndarray:
 
 
 @functools.lru_cache(maxsize=1024)
-def angle_of_view(lens: Lens, left: float, top: float, right: float, bottom: float) -> float:
-    """The largest angle from the axis [rad] that is seen in a picture; its sides in focal lengths from the axis."""
+def angle_of_view(lens: Lens, _family: Family, left: float, top: float, right: float, bottom: float) -> float:
+    """The largest angle from the axis [rad] that is seen in a picture; its sides in focal lengths from the axis.
+
+    ``_family``: the lens's, since the name of its model may get another.
+    """
     if lens.family.wide:
         return lens.limit
     rays = lens.undistorted(np.array([(x, y) for x in (left, right) for y in (top, bottom)]))
@@ -143,10 +146,10 @@ def angle_of_view(lens: Lens, left: float, top: float, right: float, bottom: flo
 
 
 @functools.lru_cache(maxsize=1024)
-def check_picture(lens: Lens, left: float, top: float, right: float, bottom: float) -> None:
+def check_picture(lens: Lens, _family: Family, left: float, top: float, right: float, bottom: float) -> None:
     """Refuse a picture that the lens does not fill.
 
-    Of a wide lens the corners may be empty, outside of a circle that touches an edge.
+    Of a wide lens the corners may be empty, outside of a circle that touches an edge. Arguments: :func:`angle_of_view`.
 
     Raises:
         InputError: if its coefficients fold it inside of the picture, or a panorama is not one of all around.
