@@ -36,10 +36,9 @@ def to_bytes(image: "torch.Tensor", linear: bool = False) -> "np.ndarray":
 
 
 def harmonics_at(x: Any, y: Any, z: Any, degree: int) -> list:
-    """Of unit vectors, [(degree + 1)^2]: the recurrences of Sloan (2013), with the signs of the trainers' files.
+    """Of unit vectors, (degree + 1)^2 arrays as x: the recurrences of Sloan (2013), signs as in the trainers' files.
 
-    The first is the same in all directions, a number; the others are arrays as x. ``even`` and ``odd`` are the cosine
-    and the sine of m times the azimuth, times the m-th power of their radius.
+    ``even`` and ``odd`` are the cosine and the sine of m times the azimuth, times the m-th power of their radius.
     """
     found = {}
     even, odd, first = x, y, 1.0
@@ -48,7 +47,7 @@ def harmonics_at(x: Any, y: Any, z: Any, degree: int) -> list:
         for band in range(m, degree + 1):
             norm = math.sqrt((2 * band + 1) / (4 * math.pi) * math.factorial(band - m) / math.factorial(band + m))
             if m == 0:
-                found[band, 0] = norm * here
+                found[band, 0] = norm * here + 0.0 * x  # an array, too, where it is a constant
             else:
                 scaled = math.sqrt(2) * norm * here
                 found[band, m], found[band, -m] = scaled * even, scaled * odd

@@ -175,5 +175,4 @@ def _turn_harmonics(turn: np.ndarray, coefficients: int) -> np.ndarray:
 def _harmonics(directions: np.ndarray, coefficients: int) -> np.ndarray:
     """Real spherical harmonics [M, K] along ``directions`` [M, 3] of any length."""
     x, y, z = (directions / np.linalg.norm(directions, axis=1, keepdims=True)).T
-    constant, *others = harmonics_at(x, y, z, COEFFICIENTS.index(coefficients))
-    return np.stack([np.full_like(x, constant), *others], axis=1)
+    return np.stack(harmonics_at(x, y, z, COEFFICIENTS.index(coefficients)), axis=1)

@@ -65,7 +65,6 @@ def spherical_harmonics(
         masks: where to compute [...]; elsewhere the result is 0.
     """
     x, y, z = torch.nn.functional.normalize(dirs, dim=-1).unbind(-1)
-    constant, *others = harmonics_at(x, y, z, degrees_to_use)
-    basis = torch.stack([torch.full_like(x, constant), *others], -1)
+    basis = torch.stack(harmonics_at(x, y, z, degrees_to_use), -1)
     sums = (basis[..., None] * coeffs[..., : basis.shape[-1], :]).sum(-2)
     return sums if masks is None else torch.where(masks[..., None], sums, 0.0)
