@@ -20,7 +20,7 @@ from warp_splat.errors import InputError
 from warp_splat.formats.coordinates import kept
 from warp_splat.formats.files import Unexpected, atomic_write, entries_of, reading, write_bytes
 from warp_splat.formats.gltf_container import CHUNK, HEADER, VISIBILITY, Document, held
-from warp_splat.formats.splats import COEFFICIENTS, SplatArrays, SplatFile, concatenated, decompose, frame, turned
+from warp_splat.formats.splats import COEFFICIENTS, SplatArrays, SplatFile, concatenated, frame, placed, turned
 from warp_splat.formats.stored import LOG_SCALES, SH_C0, clipped, log_scales, logit, sigmoid, unit_quats
 from warp_splat.text import Report
 
@@ -88,20 +88,19 @@ def load_gltf(path: str | Path, report: Report = print) -> SplatFile:
         if unknown := [name for name in required if not isinstance(name, str) or name not in UNDERSTOOD]:
             raise Unexpected(f"one that needs the extension {unknown[0]!r:.80}; export it without")
         meshes = [(entries_of(mesh, "primitives"), world) for mesh, world in document.placed_meshes()]
-        placed = [(piece, world) for pieces, world in meshes for piece in pieces if NAME in held(piece, "extensions")]
-        if not 0 < len(placed) <= MOST_PIECES:
-            raise Unexpected(f"{len(placed)} meshes of them in its scene, at most {MOST_PIECES} are read")
+        found = [(piece, world) for pieces, world in meshes for piece in pieces if NAME in held(piece, "extensions")]
+        if not 0 < len(found) <= MOST_PIECES:
+            raise Unexpected(f"{len(found)} meshes of them in its scene, at most {MOST_PIECES} are read")
         notes: list[str] = []
         lengths = {buffer.path: buffer.length for buffer in document.buffers}  # those that are one file counted once
         parts, room = [], sum(lengths.values()) // LEAST_BYTES
-        for piece, world in placed:
+        for piece, world in found:
             splats = _read_primitive(document, piece, notes.append)
             room -= len(splats.means)
             if room < 0:
                 raise Unexpected("more Gaussians than its data has room for, some placed many times")
-            turn, translation, scale = decompose(world, notes.append)
-            parts.append(turned(splats, frame(AXES) @ turn, frame(AXES) @ translation, scale))
-        told = [piece["extensions"][NAME] for piece, _ in placed]
+            parts.append(placed(splats, world, frame(AXES), notes.append))
+        told = [piece["extensions"][NAME] for piece, _ in found]
         linear = {extension.get("colorSpace") == COLOR_SPACES[1] for extension in told}
         if len(linear) > 1:
             raise Unexpected("meshes of which some are in linear light and some are not; export them alike")

@@ -136,10 +136,15 @@ def turned(
         )
 
 
-def decompose(matrix: np.ndarray, report: Report, unit: float = 1.0) -> tuple[np.ndarray, np.ndarray, float]:
-    """Rotation [3, 3], translation [3] and scale of a transform [4, 4]; a mirror is part of the rotation.
+def placed(splats: SplatArrays, matrix: np.ndarray, axes: np.ndarray, report: Report, unit=1.0) -> SplatArrays:
+    """The Gaussians after a transform, in our axes; a mirror is part of its rotation.
 
-    ``report`` is told of a place that float32 rounds by more than a thousandth, in ``unit`` of ours.
+    Args:
+        splats: as the file has them.
+        matrix: the transform [4, 4], to axes of the file.
+        axes: from these to ours, [3, 3]; see :func:`frame`.
+        report: is told of a place that float32 rounds by more than a thousandth of ours.
+        unit: of the file, in ours.
 
     Raises:
         Unexpected: if it stretches or shears, which would need other Gaussians.
@@ -152,7 +157,7 @@ def decompose(matrix: np.ndarray, report: Report, unit: float = 1.0) -> tuple[np
     if (step := 2.0**-23 * unit * np.abs(matrix[:3, 3]).max()) > 2e-3:
         report(f"so far from the origin, positions are rounded to steps of about {step:.1g}; move it nearer")
     u, _, v = np.linalg.svd(turn)
-    return u @ v, matrix[:3, 3], scale
+    return turned(splats, axes @ (u @ v), unit * (axes @ matrix[:3, 3]), unit * scale)
 
 
 def concatenated(parts: Sequence[SplatArrays]) -> SplatArrays:

@@ -23,7 +23,7 @@ from warp_splat.errors import InputError
 from warp_splat.formats.coordinates import kept
 from warp_splat.formats.files import Unexpected, atomic_write, reading
 from warp_splat.formats.gltf import COORDINATES, RENDER_MODE, SOME_MIP
-from warp_splat.formats.splats import COEFFICIENTS, SplatArrays, SplatFile, concatenated, decompose, frame, turned
+from warp_splat.formats.splats import COEFFICIENTS, SplatArrays, SplatFile, concatenated, frame, placed, turned
 from warp_splat.formats.stored import LOG_SCALES, clipped, log_scales, logit, sigmoid, unit_quats
 from warp_splat.text import Report
 
@@ -130,9 +130,7 @@ def load_usd(path: str | Path, report: Report = print) -> SplatFile:
         parts, places = [], UsdGeom.XformCache(now)
         for prim in prims:
             world = np.array(places.GetLocalToWorldTransform(prim)).T  # USD multiplies from the left
-            turn, translation, scale = decompose(world, notes.append, unit)
-            splats = _read_prim(prim, now, notes.append)
-            parts.append(turned(splats, axes @ turn, unit * (axes @ translation), unit * scale))
+            parts.append(placed(_read_prim(prim, now, notes.append), world, axes, notes.append, unit))
         mip = [prim.GetCustomDataByKey(RENDER_MODE) == "mip" for prim in prims]
         notes += [SOME_MIP] * (any(mip) and not all(mip))
         told = stage.GetRootLayer().customLayerData.get(COORDINATES, "null")
