@@ -15,8 +15,10 @@ from scipy.spatial.transform import Rotation
 from warp_splat.camera import Camera
 from warp_splat.config import NEAR
 from warp_splat.lenses import Lens
+from warp_splat.rendering.camera_paths import overview
+from warp_splat.scene.types import visible
 from warp_splat.viewer import server
-from warp_splat.viewer.browser_camera import browser_camera, fitting_fov, framed, is_at, look_at_all, pivot, sized
+from warp_splat.viewer.browser_camera import browser_camera, fitting_fov, framed, is_at, pivot, sized
 from warp_splat.viewer.picture import depth_colors, depth_range, overlay
 from warp_splat.viewer.watcher import FEWEST, MOST, pixels_after
 
@@ -85,16 +87,17 @@ def test_pivot_lies_ahead(subject):
 
 
 @pytest.mark.parametrize("means", [np.zeros((0, 3)), np.zeros((1, 3)), np.full((5, 3), 1e6), np.eye(3) * 1e-9])
-def test_look_at_all(means):
-    look = look_at_all(means.astype(np.float32))
-    assert np.isfinite(np.concatenate(look[:3])).all() and np.linalg.norm(look.position - look.target) > 1e-4
+def test_overview(means):
+    camera, middle = overview(means.astype(np.float32))
+    assert np.isfinite(camera.translation).all() and np.linalg.norm(camera.center - middle) > 1e-4
 
 
-def test_look_at_all_sees_the_bulk():
+def test_overview_sees_the_bulk():
     means = np.random.default_rng(0).normal((5, 6, 7), 0.1, (1000, 3))
     means[0] = 1e6  # a floater
-    look = look_at_all(means)
-    assert np.abs(look.target - (5, 6, 7)).max() < 0.1 and 0.1 < np.linalg.norm(look.position - look.target) < 2
+    camera, middle = overview(means)
+    assert np.abs(middle - (5, 6, 7)).max() < 0.1 and 0.1 < np.linalg.norm(camera.center - middle) < 2
+    assert visible(camera, means).mean() > 0.8
 
 
 @pytest.mark.parametrize(("fixed", "rate"), [(0.02, 1e-7), (0.02, 5e-6), (0.09, 1e-6), (0.001, 1e-9), (0.5, 1e-6)])

@@ -22,6 +22,7 @@ from warp_splat.formats.exposures import read_exposures
 from warp_splat.formats.files import write_text
 from warp_splat.formats.splats import SplatArrays
 from warp_splat.kernels import falloff, harmonics
+from warp_splat.rendering.camera_paths import overview
 
 SHADERS = ("screen.glsl", "project.glsl", "outline.glsl", "blend.glsl", "resolve.glsl")
 HARMONICS = ("C0", "C1", "C2A", "C2B", "C2C", "C3A", "C3B", "C3C", "C3D", "C3E")
@@ -30,7 +31,6 @@ SCRIPTS = ("camera.js", "renderer.js", "viewer.js")
 LONGEST = 2**29  # characters of Gaussians in a page: none larger was ever tried
 MOST_MOVING = 3 * pack.CHUNK  # Gaussians drawn as they are while the camera moves
 LARGE = 100  # MB: a page above it is called large
-START_SIZE, START_FOV = (1200, 800), 0.9  # of the view of a file that comes without cameras: px, rad (vertical)
 
 
 def export_html(config: ExportHtmlConfig) -> int:
@@ -53,7 +53,7 @@ def export_html(config: ExportHtmlConfig) -> int:
         "BACKGROUND": float(bool(trained.get("white_background"))),
     }
     behind, exposures = (read(config.model, iteration) for read in (model_folder.read_environment, read_exposures))
-    page = make_page(Path(config.model).resolve().name, kept, cameras or [("start", _start(kept))], options)
+    page = make_page(Path(config.model).resolve().name, kept, cameras or [("start", overview(kept.means)[0])], options)
     write_text(path, page)
     size, total = len(page) / 1e6, len(splats.means)
     print(f"{path}: {len(kept.means)} of {total} Gaussians, {len(cameras)} cameras, {size:.1f} MB; for any browser")
@@ -71,17 +71,6 @@ def export_html(config: ExportHtmlConfig) -> int:
     if size > LARGE:
         print("  This is large, and phones lack the memory; --max_gaussians N keeps the N that matter most.")
     return 0
-
-
-def _start(splats: SplatArrays) -> Camera:
-    """A view of the middle of the Gaussians, along z with y down, from where most of them are in the image."""
-    means = splats.means.astype(np.float64) if len(splats.means) else np.zeros((1, 3))
-    middle = np.median(means, axis=0)
-    radius = np.percentile(np.linalg.norm(means - middle, axis=1), 80) or 1.0
-    center = 0.5 * np.array(START_SIZE)
-    focal = center[1] / np.tan(0.5 * START_FOV)
-    distance = max(radius / np.sin(0.5 * START_FOV), radius + 2.0 * constants.NEAR)  # what is nearer does not show
-    return Camera(*START_SIZE, focal, focal, *center, np.eye(3), np.array([0, 0, distance]) - middle)
 
 
 def make_page(name: str, splats: SplatArrays, cameras: list[tuple[str, Camera]], options: dict[str, object]) -> str:

@@ -1,10 +1,11 @@
-"""Cameras for videos: an orbit, a spiral, or a smooth path through the cameras of training."""
+"""Cameras for videos: an orbit, a spiral, or a smooth path through those of training; and one where none is known."""
 
 from dataclasses import replace
 
 import numpy as np
 
 from warp_splat.camera import Camera
+from warp_splat.config import NEAR
 from warp_splat.errors import InputError
 from warp_splat.scene.types import Scene, visible
 
@@ -54,6 +55,20 @@ def orbit_cameras(center: np.ndarray, up: np.ndarray, start: np.ndarray, count: 
 def origin_orbit(count: int, lens: Camera = ORBIT_LENS) -> list[Camera]:
     """``count`` cameras around the world's origin, which takes no scene; y points down, as in COLMAP's cameras."""
     return orbit_cameras(np.zeros(3), np.array([0.0, -1.0, 0.0]), np.array([0.0, 0.0, -ORBIT_RADIUS]), count, lens)
+
+
+def overview(means: np.ndarray) -> tuple[Camera, np.ndarray]:
+    """A camera before Gaussians of which none is known, and their middle [3], at which it looks along z with y down.
+
+    Most of them are in view. ``means``: [N, 3] world units, none or wherever they are.
+    """
+    means = means.astype(np.float64) if len(means) else np.zeros((1, 3))
+    middle, half_view = np.median(means, axis=0), 0.5 * ORBIT_VIEW[1]
+    radius = np.percentile(np.linalg.norm(means - middle, axis=1), 80) or 1.0
+    distance = max(radius / np.sin(half_view), radius + 2.0 * NEAR)  # what is nearer does not show
+    focal = HALF[1] / np.tan(half_view)
+    lens = Camera(*ORBIT_SIZE, focal, focal, *HALF, np.eye(3), np.zeros(3))
+    return placed_at(lens, np.eye(3), middle - [0.0, 0.0, distance]), middle
 
 
 def focus_point(scene: Scene) -> tuple[np.ndarray, np.ndarray, float]:

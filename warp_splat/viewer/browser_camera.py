@@ -2,7 +2,6 @@
 
 from contextlib import suppress
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -15,18 +14,8 @@ SAME_ANGLE = 0.002  # rad
 SAME_PLACE = 0.002  # of the distance to what one looks at
 USUAL_WINDOW = (16, 9)
 MOST_PIXELS = 65_000  # along an edge; JPEG has 65,535
-VIEW_ANGLE = 0.9  # rad, vertical field of view where no camera says another
 
 Box = tuple[slice, slice]  # rows and columns of a window
-
-
-class Look(NamedTuple):
-    """A place to look from, in world coordinates, as a browser's controls want it."""
-
-    position: np.ndarray  # [3]
-    target: np.ndarray  # [3], what they orbit
-    up: np.ndarray  # [3], unit length
-    fov: float  # vertical field of view, rad
 
 
 def browser_camera(wxyz, position, fov: float, width: int, height: int) -> Camera:
@@ -90,21 +79,3 @@ def pivot(camera: Camera, subject: np.ndarray) -> np.ndarray:
     apart = float(np.linalg.norm(subject - camera.center))
     ahead = float((subject - camera.center) @ camera.forward)
     return camera.center + (ahead if ahead > 0.1 * apart > 0 else max(apart, 1.0)) * camera.forward
-
-
-def look_from(camera: Camera, subject: np.ndarray, up: np.ndarray) -> Look:
-    """Where a photograph's camera stood, upright; in a window of unknown shape."""
-    return Look(camera.center, pivot(camera, subject), up, fitting_fov(camera, *USUAL_WINDOW))
-
-
-def look_at_all(means: np.ndarray) -> Look:
-    """How to stand before Gaussians of which no camera is known: most of them in view, world y pointing down.
-
-    Args:
-        means: [N, 3]; none or wherever they are.
-    """
-    target, reach = np.zeros(3), 1.0
-    if len(means):
-        low, middle, high = np.percentile(means.astype(np.float64), [10, 50, 90], axis=0)
-        target, reach = middle, max(float(np.linalg.norm(high - low)), 1e-3)
-    return Look(target + np.array([0.0, -0.3, -1.4]) * reach, target, np.array([0.0, -1.0, 0.0]), VIEW_ANGLE)

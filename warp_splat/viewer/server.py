@@ -22,11 +22,11 @@ from warp_splat.errors import InputError
 from warp_splat.formats.exposures import Exposures
 from warp_splat.gaussians import GaussianModel
 from warp_splat.raster.api import RenderOutput
-from warp_splat.rendering.camera_paths import focus_point
+from warp_splat.rendering.camera_paths import focus_point, overview
 from warp_splat.rendering.finished import as_photographed
 from warp_splat.runtime.devices import memory_explained
 from warp_splat.scene.types import Scene, View
-from warp_splat.viewer.browser_camera import look_at_all, look_from
+from warp_splat.viewer.browser_camera import USUAL_WINDOW, fitting_fov, pivot
 from warp_splat.viewer.picture import KINDS, overlay, paint
 from warp_splat.viewer.watcher import LARGEST, MOST, Watcher, pixels_after
 
@@ -72,10 +72,10 @@ class Viewer(AbstractContextManager):
         if scene:
             self.views = {view.name: view for view in (*scene.train, *scene.test)}
             self.subject, up, _ = focus_point(scene)
-            look = look_from(scene.train[0].camera, self.subject, up)
+            camera = scene.train[0].camera
         else:
-            look = look_at_all(model.parameters["means"].detach().cpu().numpy())
-            self.subject = look.target
+            camera, self.subject = overview(model.parameters["means"].detach().cpu().numpy())
+            up = -camera.rotation[1]
         self.watchers: dict[int, Watcher] = {}
         self.left_at = -DESERTED  # when the last browser did, on time.monotonic
         self._woken = threading.Event()
@@ -88,9 +88,10 @@ class Viewer(AbstractContextManager):
         self.gui.configure_theme(show_share_button=False)  # a click on it would show the page to the internet
         self._facts = self.gui.add_markdown("")
         self.refresh()
-        self.server.scene.set_up_direction(look.up)
+        self.server.scene.set_up_direction(up)
         start = self.server.initial_camera
-        start.position, start.look_at, start.up, start.fov = look
+        start.position, start.look_at, start.up = camera.center, pivot(camera, self.subject), up
+        start.fov = fitting_fov(camera, *USUAL_WINDOW)
         self.server.on_client_connect(self._enter)
         self.server.on_client_disconnect(self._leave)
 
