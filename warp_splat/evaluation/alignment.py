@@ -41,7 +41,7 @@ def find_pose(draw: Callable[[CameraParameters], torch.Tensor], view: View, exte
 
     def loss(numbers: np.ndarray) -> tuple[float, np.ndarray]:
         twist = torch.from_numpy(numbers).requires_grad_()
-        image = draw(_moved(camera, twist * units))
+        image = draw(CameraParameters(camera, twist * units))
         difference = ((image - photo.to(image.device)) * mask.to(image.device)).permute(2, 0, 1)
         levels = [level for level in LEVELS if level <= min(difference.shape[1:])]
         errors = torch.stack([avg_pool2d(difference, level).square().mean() for level in levels]).sum()
@@ -52,9 +52,4 @@ def find_pose(draw: Callable[[CameraParameters], torch.Tensor], view: View, exte
 
     near = [(-FARTHEST, FARTHEST)] * 6
     found = minimize(loss, np.zeros(6), jac=True, method="L-BFGS-B", bounds=near, options={"maxfun": STEPS})
-    return _moved(camera, torch.from_numpy(found.x) * units).camera
-
-
-def _moved(camera: Camera, twist: torch.Tensor) -> CameraParameters:
-    lens = torch.tensor([camera.fx, camera.fy, camera.cx, camera.cy], dtype=torch.float64)
-    return CameraParameters(camera, twist, lens)
+    return CameraParameters(camera, torch.from_numpy(found.x) * units).camera
