@@ -208,7 +208,7 @@ NEEDS = "rolling_shutter: expected with_ut=True and viewmats_rs"
     ("changes", "found"),
     [
         ({"radial_coeffs": torch.zeros(2, 6)}, "radial_coeffs: expected None without with_ut=True"),
-        (UNSCENTED | {"radial_coeffs": torch.zeros(2, 4)}, r"radial_coeffs: expected a tensor \[2, 6\]"),
+        (UNSCENTED | {"radial_coeffs": torch.zeros(2, 4)}, r"radial_coeffs: expected shape \[2, 6\]"),
         (UNSCENTED | {"thin_prism_coeffs": torch.full((2, 4), torch.nan)}, "thin_prism_coeffs: expected finite"),
         (
             FISHEYE_CAMERA | {"tangential_coeffs": torch.zeros(2, 2)},
@@ -217,7 +217,7 @@ NEEDS = "rolling_shutter: expected with_ut=True and viewmats_rs"
         (UNSCENTED | {"camera_model": "ortho"}, "camera_model: expected pinhole or fisheye where with_ut is True"),
         (ROLLING | UNSCENTED, f"{NEEDS} with ROLLING_LEFT_TO_RIGHT"),
         (ROLLING | {"viewmats_rs": torch.eye(4).repeat(2, 1, 1)}, NEEDS),
-        (ROLLING | UNSCENTED | {"viewmats_rs": torch.eye(4)}, r"viewmats_rs: expected a tensor \[2, 4, 4\]"),
+        (ROLLING | UNSCENTED | {"viewmats_rs": torch.eye(4)}, r"viewmats_rs: expected shape \[2, 4, 4\]"),
         (ROLLING | UNSCENTED | {"viewmats_rs": torch.zeros(2, 4, 4)}, "viewmats_rs: expected matrices from world to"),
     ],
 )

@@ -9,7 +9,7 @@ import torch
 
 from warp_splat.config import CHANNELS_MOST
 from warp_splat.errors import InputError
-from warp_splat.raster.checks import CAMERA_PIXELS_MOST, check_opacities, check_tensor, is_one_of
+from warp_splat.raster.checks import CAMERA_PIXELS_MOST, check_choice, check_opacities, check_tensor, is_one_of
 from warp_splat.raster.drivers import driver_of
 
 CHOICES = {
@@ -60,7 +60,7 @@ def check_request(request: Request) -> Request:
         raise InputError(f"means: expected a scene or more, got {list(means.shape)}.")
     if request.covars is not None:  # then these are ignored
         given = given | {"quats": means.new_ones(*batch, count, 4), "scales": means.new_ones(*batch, count, 3)}
-    _check_tensor("colors", colors, None, means.device)
+    _check_tensor("colors", colors, getattr(colors, "shape", ()), means.device)
     per_view = _check_colors(request, batch, count, cameras)
     shapes: dict[str, tuple[int, ...]] = {
         "means": (count, 3),
@@ -125,8 +125,7 @@ def _check_choices(request: Request) -> str:
     if shutter != "GLOBAL" and not (given["with_ut"] and given["viewmats_rs"] is not None):
         raise InputError(f"rolling_shutter: expected with_ut=True and viewmats_rs with {shutter}; give both.")
     for name, values in CHOICES.items():
-        if given[name] not in values:
-            raise InputError(f"{name}: expected one of {', '.join(values)}, got {given[name]!r:.60}.")
+        check_choice(name, given[name], values)
     if given["with_ut"] and given["covars"] is not None:
         raise InputError("covars: expected None where with_ut is True; give quats and scales.")
     if given["with_ut"] and request.camera_model == "ortho":
@@ -149,11 +148,8 @@ def _check_choices(request: Request) -> str:
     return shutter.removeprefix("GLOBAL")
 
 
-def _check_tensor(name: str, tensor: Any, shape: tuple[int, ...] | None, device: torch.device) -> None:
-    if not isinstance(tensor, torch.Tensor) or (shape is not None and tuple(tensor.shape) != shape):
-        wanted = "a tensor" if shape is None else f"a tensor {list(shape)}"
-        raise InputError(f"{name}: expected {wanted}, got {_found(tensor)}.")
-    check_tensor(name, tensor, tuple(tensor.shape), device)
+def _check_tensor(name: str, tensor: Any, shape: tuple[int, ...], device: torch.device) -> None:
+    check_tensor(name, tensor, shape, device)
     if not bool(tensor.detach().isfinite().all()):
         raise InputError(f"{name}: expected finite numbers, got some that are not.")
 
