@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from warp_splat.errors import InputError, refusing
+from warp_splat.errors import refusing
 from warp_splat.evaluation.metrics import METRICS, Metric, masked, unit_images
 from warp_splat.formats.files import Unexpected, reading
 
@@ -75,10 +75,8 @@ def _load_lpips(path: str) -> dict[str, Metric]:
         model = LPIPS(net=network, pnet_rand=True, verbose=False)  # without weights, or it would download them
     # "slice2.5.weight" is the layer "features.5.weight" of torchvision
     layers = {layer: f"features.{layer.partition('.')[2]}" for layer in model.net.state_dict()}
-    try:
+    with refusing((KeyError, RuntimeError), f"{path}: expected {WEIGHTS}, found others"):
         model.net.load_state_dict({layer: weights[theirs] for layer, theirs in layers.items()})
-    except (KeyError, RuntimeError) as error:
-        raise InputError(f"{path}: expected {WEIGHTS}, found others.") from error
     name, _, signed = NETWORKS[network]
 
     def measure(image: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = None) -> float:
@@ -94,11 +92,9 @@ def _load_lpips(path: str) -> dict[str, Metric]:
 
 def _load_weights(path: Path) -> dict[str, Any]:
     """The state of a network; nothing in the file is run."""
-    with reading(path, WEIGHTS):
+    with reading(path, WEIGHTS), open(path, "rb") as file:
         try:
-            weights = torch.load(path, map_location="cpu", weights_only=True)
-        except OSError:
-            raise
+            weights = torch.load(file, map_location="cpu", weights_only=True)
         except Exception as error:  # what torch raises for another file depends on its first bytes
             raise Unexpected("a file that torch does not read as weights") from error
         if not isinstance(weights, dict) or not any(layer in weights for _, layer, _ in NETWORKS.values()):
