@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
+import zstandard
 
 from warp_splat.formats.files import Unexpected, atomic_write, check_expansion, reading
 from warp_splat.formats.splats import COEFFICIENTS, SplatArrays, SplatFile, frame, turned
@@ -24,7 +25,7 @@ from warp_splat.formats.stored import clipped, from_smallest_three, logit, sigmo
 from warp_splat.text import Report
 
 MAGIC = b"NGSP"
-DAMAGE = (zlib.error, EOFError, gzip.BadGzipFile)  # what a gzip file raises then
+DAMAGE = (zlib.error, EOFError, gzip.BadGzipFile, zstandard.ZstdError)  # what libraries raise then
 HEADER = struct.Struct("<4sIIBBBB")  # magic, version, count, SH degree, fractional bits, flags, streams (version 4)
 HEADER4 = struct.Struct("<4sIIBBBBI12x")  # ... and where the table of sizes begins
 FLAG_ANTIALIASED = 1
@@ -169,8 +170,6 @@ def _read_gzip(source: BinaryIO, file_bytes: int) -> Packed:
 
 
 def _read_zstd(source: BinaryIO, file_bytes: int) -> Packed:
-    import zstandard  # noqa: PLC0415 - only files of version 4 need it
-
     header = HEADER4.unpack(_exactly(source, HEADER4.size))
     _, version, count, degree, _, _, streams, table = header
     if version != 4:
@@ -186,11 +185,8 @@ def _read_zstd(source: BinaryIO, file_bytes: int) -> Packed:
         if announced != size or packed_size > file_bytes:
             raise ValueError(f"a stream of {packed_size} bytes for {announced}, expected {size}")
         decoder = zstandard.ZstdDecompressor(max_window_size=2**27)
-        try:
-            with decoder.stream_reader(_exactly(source, packed_size)) as reader:
-                found.append(_exactly(reader, size))
-        except zstandard.ZstdError as error:
-            raise ValueError(str(error)) from error
+        with decoder.stream_reader(_exactly(source, packed_size)) as reader:
+            found.append(_exactly(reader, size))
     return header, found + [b""] * (len(sizes) - len(found)), records
 
 
