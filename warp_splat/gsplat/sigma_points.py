@@ -46,7 +46,6 @@ def moved(request: Request, points: torch.Tensor, time: torch.Tensor) -> torch.T
 
     All float64, with S and C as first dimensions.
     """
-    assert request.viewmats_rs is not None
     more = (slice(None), slice(None), *[None] * (time.dim() - 2))
     first, last = (matrices.double()[more] for matrices in (request.viewmats, request.viewmats_rs))
     start, end = first[..., :3, :3], last[..., :3, :3]
