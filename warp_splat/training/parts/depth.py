@@ -66,16 +66,13 @@ class Depth:
         """The expected depth."""
         return replace(options, depth=True)
 
-    def weight(self, iteration: int) -> float:
-        """Log-linear between those at start and end, as in the reference."""
-        start, end = self.options.depth_l1_weight_init, self.options.depth_l1_weight_final
-        return log_linear(start, end, iteration, self.iterations)
-
     def loss(self, loss: torch.Tensor, out: RenderOutput, step: Step) -> torch.Tensor:
-        """Add the term, of points and of maps."""
+        """Add the term, of points and of maps; its weight falls log-linearly, as in the reference."""
+        start, end = self.options.depth_l1_weight_init, self.options.depth_l1_weight_final
+        weight = log_linear(start, end, step.iteration, self.iterations)
         with stage("depth"):
             for target in self._at_size(step.view, out.alpha.shape):
-                loss = loss + (self.weight(step.iteration) * self._error(out, target)).to(loss.dtype)
+                loss = loss + (weight * self._error(out, target)).to(loss.dtype)
         return loss
 
     def _error(self, out: RenderOutput, target: Target) -> torch.Tensor:
