@@ -43,13 +43,10 @@ def orbit_cameras(center: np.ndarray, up: np.ndarray, start: np.ndarray, count: 
         count: cameras.
         lens: size and intrinsics of all of them.
     """
-    arm = start - center
-    lift = np.dot(arm, up) * up
-    first = arm - lift
-    second = np.cross(up, first)
-    angles = 2.0 * np.pi * np.arange(count) / count
-    places = [center + lift + np.cos(angle) * first + np.sin(angle) * second for angle in angles]
-    return [look_at(lens, place, center, up) for place in places]
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415 - slow to load, and other paths do without
+
+    turns = Rotation.from_rotvec(np.outer(2.0 * np.pi * np.arange(count) / count, up))
+    return [look_at(lens, center + arm, center, up) for arm in turns.apply(start - center)]
 
 
 def origin_orbit(count: int, lens: Camera = ORBIT_LENS) -> list[Camera]:
