@@ -39,9 +39,8 @@ def export_html(config: ExportHtmlConfig) -> int:
     Raises:
         InputError: if the model cannot be read, is too large for browsers, or the page cannot be written.
     """
-    if (path := Path(config.page)).suffix.lower() not in (".html", ".htm"):
-        raise InputError(f"{path}: expected the name of a page, which ends in .html; found {path.suffix!r}.")
-    model_folder.check_output(path)
+    path = Path(config.page)
+    model_folder.check_output(path, endings=(".html", ".htm"))
     iteration, (splats, *_), trained = model_folder.open_model(config.model, crop=config.crop)
     cameras = [*model_folder.read_refined(config.model, iteration).items()]
     cameras = cameras or model_folder.read_cameras(model_folder.folder_of(config.model))

@@ -51,13 +51,16 @@ def check_place(folder: Path) -> None:
         raise InputError(f"{folder}: expected a folder that can be written ({place} {reason}); choose another.")
 
 
-def check_output(path: Path, model: str | Path = "", iteration: int = -1) -> None:
+def check_output(path: Path, model: str | Path = "", iteration: int = -1, endings: Sequence[str] = ()) -> None:
     """Refuse a file that could not be written, as far as one sees without trying: before the work.
 
     Raises:
-        InputError: if a folder has its name, or the Gaussians of ``model`` are read from it; or as
-            :func:`check_place` of its folder.
+        InputError: if it has none of these ``endings``, if there are any; if a folder has its name, or the Gaussians of
+            ``model`` are read from it; or as :func:`check_place` of its folder.
     """
+    if endings and path.suffix.lower() not in endings:
+        wanted = f"expected a name that ends in {', '.join(endings)}"
+        raise InputError(f"{path}: {wanted}, found {path.suffix or 'no ending'!r}; rename it.")
     if model and path.exists():
         file = gaussians_file(model, -1 if is_file_of_gaussians(model) else find_iteration(model, iteration))
         if file.exists() and path.samefile(file):

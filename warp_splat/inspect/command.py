@@ -6,7 +6,6 @@ from collections import Counter
 from pathlib import Path
 
 from warp_splat.config import InspectConfig
-from warp_splat.errors import InputError
 from warp_splat.formats.model_folder import check_output
 from warp_splat.inspect import geometry, verdicts
 from warp_splat.inspect.cost import check_cost
@@ -27,9 +26,7 @@ def inspect(config: InspectConfig) -> int:
     started = time.perf_counter()
     source = Path(config.scene)
     page = Path(config.out or Path("output") / "inspect" / f"{source.resolve().name}.html")
-    if page.suffix.lower() not in (".html", ".htm"):
-        raise InputError(f"--out {page}: expected the name of a page, which ends in .html; found {page.suffix!r}.")
-    check_output(page)
+    check_output(page, endings=(".html", ".htm"))
     if not has_cameras(source):
         if source.is_dir() and not (source / "point_cloud").is_dir():
             time_of_cameras(source, print)

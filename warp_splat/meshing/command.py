@@ -44,11 +44,10 @@ def mesh(config: MeshConfig) -> int:
     Raises:
         InputError: if the model, its scene, an option or a needed package is not usable; if there is no surface.
     """
-    if (output := Path(config.output)).suffix.lower() not in ENDINGS:
-        raise InputError(f"{output}: expected a name that ends in {', '.join(ENDINGS)}; rename it.")
+    output = Path(config.output)
     pieces_place = output.with_name(f"{output.stem}_collision{output.suffix}")
     for place in (output, pieces_place) if config.collision else (output,):
-        check_output(place, config.model, config.iteration)
+        check_output(place, config.model, config.iteration, ENDINGS)
     if config.triangles and config.watertight:
         raise InputError("--triangles: simplifying would open what --watertight closes; take larger voxels (--voxel).")
     for package, wanted in (("trimesh", True), ("fast_simplification", config.triangles), ("vhacdx", config.collision)):
