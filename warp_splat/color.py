@@ -47,7 +47,7 @@ def harmonics_at(x: Any, y: Any, z: Any, degree: int) -> list:
         for band in range(m, degree + 1):
             norm = math.sqrt((2 * band + 1) / (4 * math.pi) * math.factorial(band - m) / math.factorial(band + m))
             if m == 0:
-                found[band, 0] = norm * here + 0.0 * x  # an array, too, where it is a constant
+                found[band, 0] = norm * here * x**0  # an array, too, where it is a constant
             else:
                 scaled = math.sqrt(2) * norm * here
                 found[band, m], found[band, -m] = scaled * even, scaled * odd
