@@ -68,7 +68,7 @@ WORDS = {
     "root": np.sqrt,
     "angle": np.arctan2,
     "less": np.less,
-    "pick": np.where,
+    "pick": lambda mask, a, b: np.where(mask > 0, a, b),
     "fill": lambda value, like: np.full_like(like, value),
 }
 

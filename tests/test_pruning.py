@@ -268,19 +268,22 @@ def test_only_what_a_crop_leaves_is_compared(folder, tmp_path, capsys):
 
 @pytest.mark.parametrize("command", [["simplify", "--keep", "0.9"], ["clean"]], ids=lambda words: words[0])
 def test_what_a_file_has_no_room_for_counts(folder, tmp_path, capsys, monkeypatch, fails, command):
-    """What is said of a .splat is what is there, which has no harmonics."""
+    """What is said of a .splat is what is there, which has no harmonics, nor a mark of antialiasing."""
     monkeypatch.setattr("warp_splat.pruning.simplify.LEVELS", (1.0,))
     splats, output = folder[1], tmp_path / "a.splat"
     sh = splats.sh.copy()
     sh[:, 0] -= 0.5
     sh[:, 2] = -0.6  # brighter from above, where the cameras are
-    save_gaussians(ply_path(tmp_path, 7), SplatFile(splats._replace(sh=sh)))
+    save_gaussians(ply_path(tmp_path, 7), SplatFile(splats._replace(sh=sh), antialiased=True))
     write_cfg_args(tmp_path, {"source_path": str(embedded_scene()), "resolution": 8, "eval": True})
     assert main([*command, str(tmp_path), "-o", str(output), "--device", "cpu"]) == 0
     out = capsys.readouterr().out
     assert "lost: " in out and "all harmonics, for which such a file has no room" in out
     opened = Opened(FinishedModel(model=str(tmp_path), device="cpu"))
-    before, after = (opened.psnr(load_gaussians(p).splats, opened.scene.train) for p in (ply_path(tmp_path, 7), output))
+    whole, left = (load_gaussians(path) for path in (ply_path(tmp_path, 7), output))
+    before, unlike = (opened.psnr(file.splats, opened.scene.train) for file in (whole, left))
+    after = opened.psnr(left.splats, opened.scene.train, OPTIONS)
+    assert opened.options.antialiasing and abs(unlike - after) > 0.02
     told = re.search(r"train PSNR (\S+) -> (\S+) dB", out)
     assert before - after > 0.3
     assert (float(told[1]), float(told[2])) == pytest.approx((before, after), abs=0.01)

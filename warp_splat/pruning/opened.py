@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from warp_splat.camera import Camera
-from warp_splat.config import CleanConfig, FinishedModel, SimplifyConfig
+from warp_splat.config import CleanConfig, FinishedModel, RasterOptions, SimplifyConfig
 from warp_splat.errors import InputError
 from warp_splat.evaluation.metrics import psnr
 from warp_splat.formats.exchange import format_of, load_gaussians, save_gaussians
@@ -66,21 +66,22 @@ class Opened(Finished):
         draw = make_renderer(GaussianModel.from_splats(marked).to(device), None, self.options)
         return lambda camera: draw(camera).image[..., 0] > COVERED
 
-    def picture_of(self, splats: SplatArrays) -> Callable[..., np.ndarray]:
+    def picture_of(self, splats: SplatArrays, options: RasterOptions | None = None) -> Callable[..., np.ndarray]:
         """A function from a camera, and whose photograph's exposure it has, to what ``splats`` look like: uint8."""
-        return self.picture(GaussianModel.from_splats(splats).to(self.setting.background.device), self.scene)
+        return self.picture(GaussianModel.from_splats(splats).to(self.setting.background.device), self.scene, options)
 
-    def psnr(self, splats: SplatArrays, views: list[View]) -> float:
-        """Mean PSNR [dB] of 8-bit renders; of one that is its photograph, 99 dB."""
-        picture = self.picture_of(splats)
+    def psnr(self, splats: SplatArrays, views: list[View], options: RasterOptions | None = None) -> float:
+        """Mean PSNR [dB] of 8-bit renders, with the model's options or others; of one that is its photograph, 99 dB."""
+        picture = self.picture_of(splats, options)
         return float(np.mean([min(psnr(picture(v.camera, v.name), v.picture, v.mask), 99.0) for v in views]))
 
     def print_quality(self, before: SplatArrays, path: Path) -> float:
         """A line for the training views and, if there are any, for those held out, of a file; the former's PSNR."""
-        after, found = load_gaussians(path).splats, []
+        after, found = load_gaussians(path), []
+        as_told = replace(self.options, antialiasing=after.antialiased)  # as those draw it who know the file alone
         for name, views in {"train": self.scene.train, "test": self.scene.test}.items():
             if views:
-                old, new = (self.psnr(splats, views) for splats in (before, after))
+                old, new = self.psnr(before, views), self.psnr(after.splats, views, as_told)
                 print(f"  {name} PSNR {old:.2f} -> {new:.2f} dB ({new - old:+.2f})")
                 found.append(new)
         return found[0]
