@@ -19,7 +19,7 @@ from warp_splat.config import RenderConfig
 from warp_splat.errors import InputError
 from warp_splat.evaluation.alignment import where_taken
 from warp_splat.evaluation.perceptual import choose_metrics
-from warp_splat.evaluation.report import DPI, new_figure, save_figure
+from warp_splat.evaluation.report import save_figure
 from warp_splat.evaluation.views import evaluate_views, metrics_line, show_views, write_views
 from warp_splat.formats import model_folder
 from warp_splat.formats.files import atomic_write
@@ -34,6 +34,7 @@ from warp_splat.scene.types import Scene, View
 from warp_splat.text import upward
 
 SCALE = (1e-6, 1.0)  # of the colors
+DPI = 100
 
 
 def write_maps(name: str, find: Callable[[Camera], torch.Tensor], views: list[View], folder: Path) -> float:
@@ -56,8 +57,10 @@ def write_maps(name: str, find: Callable[[Camera], torch.Tensor], views: list[Vi
 
 def save_scaled(path: Path, values: np.ndarray) -> None:
     """Positive ``values`` [H, W] as colors, with the scale beside them."""
+    from matplotlib.figure import Figure  # noqa: PLC0415 - slow to load, only for these
+
     height, width = values.shape
-    figure = new_figure(width / DPI + 1.0, height / DPI)
+    figure = Figure(figsize=(width / DPI + 1.0, height / DPI), dpi=DPI)
     axes = figure.add_axes((0.0, 0.0, width / (width + DPI), 1.0))
     axes.set_axis_off()
     shown = axes.imshow(values.clip(*SCALE), norm="log", vmin=SCALE[0], vmax=SCALE[1], cmap="turbo", aspect="auto")
