@@ -2,23 +2,12 @@
 
 import functools
 
+import learned_cameras
 import pytest
 import scenes
 import torch
 from common import using
-from learned_cameras import (
-    DEPTH,
-    HERE,
-    LENS_ERROR,
-    NEAR,
-    OTHER,
-    PLAIN,
-    SHARP,
-    exact_render,
-    gradients_of,
-    learned,
-    split,
-)
+from learned_cameras import DEPTH, HERE, LENS_ERROR, NEAR, OTHER, PLAIN, SHARP, exact_render, gradients_of, learned
 from scenes import SCENES, scene_of
 
 from warp_splat import CameraParameters, RasterOptions, rasterize
@@ -49,7 +38,7 @@ def exact(name, options, start):
         weight[out.fragile] = 0
     loss = sum((getattr(out, key) * weight).sum() for key, weight in upstream.items())
     found = torch.autograd.grad(loss, list(numbers.values()))
-    expected = split(dict(zip(numbers, found, strict=True)))
+    expected = learned_cameras.split(dict(zip(numbers, found, strict=True)))
     return scene, {key: weight.float() for key, weight in upstream.items()}, expected
 
 

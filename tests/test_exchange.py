@@ -15,15 +15,7 @@ from common import picture_of
 from hostile import refusal
 from scenes import C0
 from scipy.spatial.transform import Rotation
-from splat_files import (
-    ENDINGS,
-    covariances,
-    seen_colors,
-    sigmoid,
-    silent,
-    some_file,
-    some_splats,
-)
+from splat_files import ENDINGS, covariances, seen_colors, sigmoid, silent, some_file, some_splats
 
 from warp_splat.cli import main
 from warp_splat.compare.scenes import make_camera

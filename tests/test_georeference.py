@@ -14,14 +14,8 @@ from splat_files import some_file
 
 from warp_splat.cli import main
 from warp_splat.errors import InputError
-from warp_splat.formats.coordinates import (
-    COMMENT,
-    MODEL_FROM_WORLD,
-    kept,
-    of_comments,
-    read_coordinates,
-    write_coordinates,
-)
+from warp_splat.formats import coordinates
+from warp_splat.formats.coordinates import COMMENT, MODEL_FROM_WORLD, of_comments, read_coordinates, write_coordinates
 from warp_splat.formats.exchange import load_gaussians, save_gaussians
 from warp_splat.formats.model_folder import ply_path, write_cameras
 from warp_splat.inspect.subject import Subject
@@ -393,7 +387,7 @@ def test_damaged_coordinates_get_one_sentence(tmp_path):
             read_coordinates(tmp_path)
     write_coordinates(tmp_path, {"origin": [1.0, 2.0, 3.0]})
     assert json.loads((tmp_path / "coordinates.json").read_text()) == read_coordinates(tmp_path)
-    assert kept({"origin": [10**400, 2, 3]}) is None and of_comments([COMMENT + "[" * 100_000]) is None
+    assert coordinates.kept({"origin": [10**400, 2, 3]}) is None and of_comments([COMMENT + "[" * 100_000]) is None
     write_coordinates(tmp_path, None)
     assert read_coordinates(tmp_path) is None
     (tmp_path / "coordinates.json").mkdir()

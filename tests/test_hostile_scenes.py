@@ -8,18 +8,10 @@ import resource
 
 import numpy as np
 import pytest
+import scene_files
 from hostile import changed, changed_json, one_sentence, refusal, replace, tried
 from hypothesis import strategies as st
-from scene_files import (
-    load,
-    texture,
-    write_blender,
-    write_colmap,
-    write_floats,
-    write_image,
-    write_model,
-    write_transforms,
-)
+from scene_files import load, texture, write_blender, write_colmap, write_floats, write_image, write_transforms
 from test_inputs import light
 
 from warp_splat.errors import InputError
@@ -40,7 +32,7 @@ def colmap(root, files, binary=True):
 
 
 def with_image(root, name):
-    write_model(root / "sparse" / "0", [name])
+    scene_files.write_model(root / "sparse" / "0", [name])
     path = root / "images" / name
     if path.suffix == ".exr":
         write_floats(path, light())

@@ -5,22 +5,11 @@ from pathlib import Path
 import numpy as np
 import OpenImageIO as oiio
 import pytest
+import scene_files
 import torch
 from hostile import refusal
 from PIL import Image
-from scene_files import (
-    HEIGHT,
-    WIDTH,
-    load,
-    project,
-    texture,
-    write_blender,
-    write_colmap,
-    write_floats,
-    write_image,
-    write_model,
-    write_transforms,
-)
+from scene_files import HEIGHT, WIDTH, load, texture, write_colmap, write_floats, write_image, write_transforms
 from splat_files import some_file
 
 from warp_splat.errors import InputError
@@ -45,7 +34,7 @@ def test_images_are_found_by_their_stems(tmp_path):
 
 def test_without_an_ending_png_goes_first(tmp_path):
     """As in the reference, which adds .png: a preview lies beside it."""
-    root = write_blender(tmp_path)
+    root = scene_files.write_blender(tmp_path)
     photo = min((root / "train").glob("*.png"))
     write_image(photo.with_suffix(".jpg"), texture())
     assert photo.name in {Path(view.name).name for view in load(root)[0].train}
@@ -53,7 +42,7 @@ def test_without_an_ending_png_goes_first(tmp_path):
 
 @pytest.mark.parametrize("name", ["../a.png", "/etc/passwd", "sub/../../a.png"])
 def test_names_that_leave_the_folder_are_refused(tmp_path, name):
-    write_model(tmp_path / "sparse" / "0", ["x.png"])
+    scene_files.write_model(tmp_path / "sparse" / "0", ["x.png"])
     path = tmp_path / "sparse" / "0" / "images.txt"
     path.write_text(path.read_text().replace("x.png", name))
     refusal(lambda: load(tmp_path), "in this folder")
@@ -69,7 +58,7 @@ def test_without_points_random_ones_in_the_views(tmp_path, kind):
     for view in scene.train:
         camera = view.camera
         depth = (scene.points @ camera.rotation.T + camera.translation)[:, 2]
-        pixels = project(camera, scene.points)
+        pixels = scene_files.project(camera, scene.points)
         inside += (depth > 0) & (np.abs(pixels / (camera.width, camera.height) - 0.5) <= 0.5 + 1e-4).all(axis=1)
     assert (inside >= 2).all()
     np.testing.assert_array_equal(scene.points, load(root)[0].points)

@@ -6,15 +6,7 @@ import numpy as np
 import pytest
 import torch
 from hostile import refusal
-from scene_files import (
-    HEIGHT,
-    WIDTH,
-    load,
-    texture,
-    write_colmap,
-    write_image,
-    write_model,
-)
+from scene_files import HEIGHT, WIDTH, load, texture, write_colmap, write_image, write_model
 from test_losses import check, differentiated
 
 from warp_splat.evaluation.metrics import METRICS, psnr, ssim

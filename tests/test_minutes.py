@@ -16,34 +16,23 @@ from warp_splat.flags import flags_of
 from warp_splat.formats.checkpoint import load_checkpoint
 from warp_splat.formats.model_folder import ply_path
 from warp_splat.runtime.distributed import ALONE
+from warp_splat.training import plan as plans
 from warp_splat.training.deadline import REACHED, Deadline, plan_training
 from warp_splat.training.options import LearnOptions, TrainConfig, schedule_of
 from warp_splat.training.photographs import shrink_at
-from warp_splat.training.plan import (
-    RATES,
-    Cost,
-    Reached,
-    StepTime,
-    Task,
-    as_flags,
-    comparable,
-    of_length,
-    plan_for,
-    seconds_of,
-    task_of,
-)
+from warp_splat.training.plan import RATES, Cost, Reached, as_flags, comparable, of_length, plan_for, seconds_of
 from warp_splat.training.record import keep, restore
 
 FAST = parse(["train", "-s", "x", "--preset", "fast"])
-TASK, COST = Task(500_000, 10_000, 1, FAST.grow.max_gaussians, (0.4, 0.7)), Cost(0.004, 3e-7, 5e-8)
+TASK, COST = plans.Task(500_000, 10_000, 1, FAST.grow.max_gaussians, (0.4, 0.7)), Cost(0.004, 3e-7, 5e-8)
 
 
 def test_costs_are_found_again():
     places = [(10_000, 30_000), (10_000, 500_000), (200_000, 500_000)]
-    found = Cost.of([StepTime(n, p, COST.step + COST.gaussian * n + COST.pixel * p) for n, p in places])
+    found = Cost.of([plans.StepTime(n, p, COST.step + COST.gaussian * n + COST.pixel * p) for n, p in places])
     assert found == pytest.approx(COST)
     seconds = (0.021, 0.02, 0.05)  # fewer pixels took longer
-    noisy = Cost.of([StepTime(*place, took) for place, took in zip(places, seconds, strict=True)])
+    noisy = Cost.of([plans.StepTime(*place, took) for place, took in zip(places, seconds, strict=True)])
     assert min(noisy) >= 0
 
 
@@ -71,13 +60,13 @@ def test_seconds_are_those_of_the_steps_added_up(factor, start, least):
 def test_points_beyond_a_limit_go_where_a_growth_shrinks(growth, least, scene):
     """Early, and a plan has no more Gaussians than it is allowed; a file of Gaussians stays whole."""
     config = TrainConfig(growth=growth, max_gaussians=1000)
-    task = task_of(config, scene, ())
+    task = plans.task_of(config, scene, ())
     assert (task.start, task.least, task.most) == (4500, least, 1000)
     plan = of_length(config, 0.02, task)
     options = plan.plugins["budget"]
     assert plan.grow.max_gaussians == least
     assert options.densify_from_iter + options.densification_interval < options.densify_until_iter / 2
-    assert task_of(config, dataclasses.replace(scene, start=object()), ()).least == 4500
+    assert plans.task_of(config, dataclasses.replace(scene, start=object()), ()).least == 4500
 
 
 @pytest.mark.parametrize("minutes", [0.2, 1, 5, 60])

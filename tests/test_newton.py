@@ -4,26 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import simulations
 import torch
 import warp as wp
 from exact_cameras import exact_render
 from hostile import refusal
 from scenes import C0
 from scipy.spatial.transform import Rotation
-from simulations import (
-    BACKGROUND,
-    BODIES,
-    CAMERAS,
-    FOV,
-    HEIGHT,
-    PLACE,
-    UNSEEN,
-    WIDTH,
-    images,
-    make_simulation,
-    newton,
-    state_of,
-)
+from simulations import BACKGROUND, BODIES, CAMERAS, FOV, HEIGHT, PLACE, UNSEEN, WIDTH, images, newton, state_of
 
 from warp_splat import Camera, InputError, Lens, RasterOptions, Shutter
 from warp_splat.compare.oracle import sh_basis
@@ -34,7 +22,7 @@ from warp_splat.raster.worlds import Worlds
 
 @pytest.fixture(scope="module")
 def simulation(tmp_path_factory):
-    return make_simulation(tmp_path_factory.mktemp("files"))
+    return simulations.make_simulation(tmp_path_factory.mktemp("files"))
 
 
 def moved(splats, transform, scale=1.0):

@@ -6,29 +6,9 @@ from types import SimpleNamespace
 import numpy as np
 import pycolmap
 import pytest
+import scene_files
 from commands import FOX, python
-from scene_files import (
-    COLORS,
-    HEIGHT,
-    POINTS,
-    WIDTH,
-    change_json,
-    check_ideal,
-    distorted_picture,
-    field_of_view,
-    fisheye,
-    load,
-    pose,
-    project,
-    radial,
-    scale_axes,
-    texture,
-    thin_prism,
-    write_blender,
-    write_colmap,
-    write_image,
-    write_model,
-)
+from scene_files import HEIGHT, POINTS, WIDTH, distorted_picture, load, texture, thin_prism, write_blender, write_colmap
 
 from warp_splat import Camera, InputError
 from warp_splat.scene.images import read_pixels, target_size
@@ -50,20 +30,20 @@ def test_colmap_cameras_points_and_pixels(tmp_path, binary):
         camera = view.camera
         assert (camera.width, camera.height) == (WIDTH, HEIGHT)
         assert (camera.fx, camera.fy, camera.cx, camera.cy) == (40, 44, 22.5, 17.25)
-        rotation, translation = pose(index)
+        rotation, translation = scene_files.pose(index)
         np.testing.assert_allclose(camera.rotation, rotation, atol=1e-12)
         np.testing.assert_allclose(camera.translation, translation, atol=1e-12)
         np.testing.assert_array_equal(view.image, texture())
         assert view.original.fx == camera.fx
     np.testing.assert_array_equal(scene.points, POINTS.astype(np.float32))
-    np.testing.assert_array_equal(scene.colors, COLORS)
+    np.testing.assert_array_equal(scene.colors, scene_files.COLORS)
     assert (scene.points.dtype, scene.colors.dtype) == (np.float32, np.uint8)
 
 
 def test_tracks_are_free_of_the_lens(tmp_path):
     """Keypoints where a lens with radial distortion draws the points; what was not triangulated is no track."""
     root = write_colmap(tmp_path, ["a.png"], camera=f"SIMPLE_RADIAL {WIDTH} {HEIGHT} 40 22.5 17.25 0.1")
-    rotation, translation = pose(0)
+    rotation, translation = scene_files.pose(0)
     x, y, z = rotation @ POINTS[:3].T + translation[:, None]
     slopes = np.stack([x / z, y / z], axis=1)
     keypoints = 40 * slopes * (1 + 0.1 * (slopes**2).sum(1, keepdims=True)) + [22.5, 17.25]
@@ -85,8 +65,8 @@ def test_scenes_without_observations_have_no_tracks(tmp_path):
 
 
 def test_simple_pinhole_and_model_directly_in_sparse(tmp_path):
-    write_model(tmp_path / "sparse", ["a.png"], camera=f"SIMPLE_PINHOLE {WIDTH} {HEIGHT} 41 20 15")
-    write_image(tmp_path / "images" / "a.png", texture())
+    scene_files.write_model(tmp_path / "sparse", ["a.png"], camera=f"SIMPLE_PINHOLE {WIDTH} {HEIGHT} 41 20 15")
+    scene_files.write_image(tmp_path / "images" / "a.png", texture())
     camera = load(tmp_path)[0].train[0].camera
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (41, 41, 20, 15)
 
@@ -101,7 +81,7 @@ def test_names_with_spaces_and_folders(tmp_path, binary):
 def test_largest_of_several_models(tmp_path):
     names = [f"{index}.png" for index in range(4)]
     write_colmap(tmp_path, names)
-    write_model(tmp_path / "sparse" / "small", names[:3], binary=True)
+    scene_files.write_model(tmp_path / "sparse" / "small", names[:3], binary=True)
     (tmp_path / "sparse" / "0").rename(tmp_path / "sparse" / "zz")
     scene, lines = load(tmp_path)
     assert len(scene.train) == 4
@@ -143,17 +123,17 @@ def test_eval_holds_out_every_eighth(tmp_path, count):
 @pytest.mark.parametrize(
     ("model", "distort", "focal", "params"),
     [
-        ("SIMPLE_RADIAL", radial, (150, 150), (-0.12,)),
-        ("RADIAL", radial, (150, 150), (0.1, -0.03)),
-        ("OPENCV", radial, (150, 156), (-0.15, 0.04, 0.002, -0.003)),
-        ("OPENCV_FISHEYE", fisheye, (110, 112), (0.02, -0.01, 0.003, 0.0)),
-        ("OPENCV_FISHEYE", fisheye, (150, 156), (0.0, 0.0, 0.0, 0.0)),
-        ("SIMPLE_RADIAL_FISHEYE", fisheye, (150, 150), (0.0,)),
-        ("FULL_OPENCV", radial, (150, 156), (-0.1, 0.03, 0.002, 0.001, -0.01, 0.02, 0.01, 0.003)),
-        ("SIMPLE_RADIAL_FISHEYE", fisheye, (150, 150), (0.02,)),
-        ("RADIAL_FISHEYE", fisheye, (150, 150), (0.02, -0.01)),
+        ("SIMPLE_RADIAL", scene_files.radial, (150, 150), (-0.12,)),
+        ("RADIAL", scene_files.radial, (150, 150), (0.1, -0.03)),
+        ("OPENCV", scene_files.radial, (150, 156), (-0.15, 0.04, 0.002, -0.003)),
+        ("OPENCV_FISHEYE", scene_files.fisheye, (110, 112), (0.02, -0.01, 0.003, 0.0)),
+        ("OPENCV_FISHEYE", scene_files.fisheye, (150, 156), (0.0, 0.0, 0.0, 0.0)),
+        ("SIMPLE_RADIAL_FISHEYE", scene_files.fisheye, (150, 150), (0.0,)),
+        ("FULL_OPENCV", scene_files.radial, (150, 156), (-0.1, 0.03, 0.002, 0.001, -0.01, 0.02, 0.01, 0.003)),
+        ("SIMPLE_RADIAL_FISHEYE", scene_files.fisheye, (150, 150), (0.02,)),
+        ("RADIAL_FISHEYE", scene_files.fisheye, (150, 150), (0.02, -0.01)),
         ("THIN_PRISM_FISHEYE", thin_prism, (150, 156), (0.02, -0.01, 0.002, 0.001, 0.003, 0.0, 0.004, -0.002)),
-        ("FOV", field_of_view, (150, 156), (0.4,)),
+        ("FOV", scene_files.field_of_view, (150, 156), (0.4,)),
     ],
 )
 def test_undistorted_image_is_the_ideal_pinhole_image(tmp_path, model, distort, focal, params, scale, resolution):
@@ -162,7 +142,7 @@ def test_undistorted_image_is_the_ideal_pinhole_image(tmp_path, model, distort, 
     pixels = distorted_picture(distort, params, width // scale, height // scale, *np.array((*focal, cx, cy)) / scale)
     root = write_colmap(tmp_path, ["a.png"], pixels, camera=" ".join(map(str, (model, *numbers))))
     scene, lines = load(root, resolution=resolution)
-    check_ideal(scene.train[0], 0.65 if resolution > 1 else 0.52)  # halved, it goes through two filters
+    scene_files.check_ideal(scene.train[0], 0.65 if resolution > 1 else 0.52)  # halved, it goes through two filters
     assert any(model in line for line in lines)
 
 
@@ -182,7 +162,7 @@ def test_native_lenses_see_points_where_colmap_does(tmp_path, scale):
     line = f"OPENCV {WIDTH} {HEIGHT} {' '.join(map(str, params))}"
     pixels = texture(WIDTH // scale, HEIGHT // scale)
     scene, lines = load(write_colmap(tmp_path, ["a.png"], pixels, camera=line), lens="native")
-    camera, (rotation, translation) = scene.train[0].camera, pose(0)
+    camera, (rotation, translation) = scene.train[0].camera, scene_files.pose(0)
     np.testing.assert_array_equal(scene.train[0].image, pixels)
     colmap = pycolmap.Camera(model="OPENCV", width=WIDTH, height=HEIGHT, params=params)
     wanted = colmap.img_from_cam(POINTS @ rotation.T + translation)
@@ -230,7 +210,7 @@ def test_jpeg(tmp_path):
     y, x = np.mgrid[:HEIGHT, :WIDTH]
     pixels = np.stack([x * 4, y * 6, 60 + x + y], axis=-1).astype(np.uint8)
     write_colmap(tmp_path, ["a.jpg"], pixels)
-    write_image(tmp_path / "images" / "a.jpg", pixels, [("Compression", "jpeg:98"), ("Orientation", 6)])
+    scene_files.write_image(tmp_path / "images" / "a.jpg", pixels, [("Compression", "jpeg:98"), ("Orientation", 6)])
     image = load(tmp_path)[0].train[0].image
     assert image.shape == pixels.shape  # as stored: not rotated by the orientation tag
     assert np.abs(image.astype(int) - pixels).mean() < 3
@@ -300,12 +280,12 @@ def test_blender_axes_and_intrinsics(tmp_path):
     np.testing.assert_allclose((camera.fx, camera.fy, camera.cx, camera.cy), (focal, focal, WIDTH / 2, HEIGHT / 2))
     center = np.array((4.0, -1.0, 1.5))
     np.testing.assert_allclose(camera.center, center)
-    np.testing.assert_allclose(project(camera, [(0, 0, 0)]), [(WIDTH / 2, HEIGHT / 2)], atol=1e-9)
-    (above,) = project(camera, [(0, 0, 0.5)])  # the world's z is up, so in the image it has a smaller y
+    np.testing.assert_allclose(scene_files.project(camera, [(0, 0, 0)]), [(WIDTH / 2, HEIGHT / 2)], atol=1e-9)
+    (above,) = scene_files.project(camera, [(0, 0, 0.5)])  # the world's z is up, so in the image it has a smaller y
     np.testing.assert_allclose(above[0], WIDTH / 2, atol=1e-9)
     assert above[1] < HEIGHT / 2 - 2
     right = np.cross(-center, (0, 0, 1))
-    (beside,) = project(camera, [0.5 * right / np.linalg.norm(right)])
+    (beside,) = scene_files.project(camera, [0.5 * right / np.linalg.norm(right)])
     np.testing.assert_allclose(beside, (WIDTH / 2 + 0.5 * focal / np.linalg.norm(center), HEIGHT / 2), atol=1e-9)
 
 
@@ -340,7 +320,7 @@ def test_blender_points_and_background(tmp_path):
 def test_blender_pose_with_uniform_scale(tmp_path):
     root = write_blender(tmp_path, train=1, test=0)
     expected = load(root)[0].train[0].camera
-    change_json(root, lambda content: scale_axes(content, (1.7, 1.7, 1.7)))
+    scene_files.change_json(root, lambda content: scene_files.scale_axes(content, (1.7, 1.7, 1.7)))
     camera = load(root)[0].train[0].camera
     np.testing.assert_allclose(camera.rotation, expected.rotation, atol=1e-9)
     np.testing.assert_allclose(camera.center, expected.center, atol=1e-9)
@@ -359,7 +339,7 @@ def test_fox():
     for view in scene.train + scene.test:
         seen = [p for p in observations.find_image_with_name(view.name).points2D if p.has_point3D()]
         points = np.array([observations.point3D(p.point3D_id).xyz for p in seen])
-        error = np.linalg.norm(project(view.original, points) - [p.xy for p in seen], axis=1)
+        error = np.linalg.norm(scene_files.project(view.original, points) - [p.xy for p in seen], axis=1)
         assert error.mean() < 1
 
 

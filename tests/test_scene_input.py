@@ -5,19 +5,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scene_files
 from hostile import refusal, replace
-from scene_files import (
-    HEIGHT,
-    WIDTH,
-    change_json,
-    load,
-    pose,
-    scale_axes,
-    texture,
-    write_blender,
-    write_colmap,
-    write_image,
-)
+from scene_files import HEIGHT, WIDTH, load, pose, scale_axes, texture, write_blender, write_colmap, write_image
 
 from warp_splat.scene.images import read_size
 
@@ -69,7 +59,7 @@ def plain_photos(root):
 
 def blender_case(change):
     def make(root):
-        change_json(write_blender(root), change)
+        scene_files.change_json(write_blender(root), change)
         return root, {}
 
     return make

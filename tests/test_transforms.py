@@ -4,23 +4,9 @@ import json
 
 import numpy as np
 import pytest
+import scene_files
 from hostile import refusal
-from scene_files import (
-    COLORS,
-    HEIGHT,
-    LENS,
-    POINTS,
-    WIDTH,
-    change_json,
-    check_ideal,
-    distorted_picture,
-    fisheye,
-    load,
-    project,
-    radial,
-    texture,
-    write_transforms,
-)
+from scene_files import HEIGHT, LENS, POINTS, WIDTH, change_json, fisheye, load, project, radial, write_transforms
 
 from warp_splat import Lens
 from warp_splat.cli import main
@@ -37,7 +23,7 @@ def test_transforms_cameras_points_and_axes(tmp_path):
     np.testing.assert_allclose(project(camera, [(0, 0, 0)]), [(22.5, 17.25)], atol=1e-9)
     assert project(camera, [(0, 0, 0.5)])[0, 1] < 15  # the world's z is up
     np.testing.assert_array_equal(scene.points, POINTS.astype(np.float32))
-    np.testing.assert_array_equal(scene.colors, COLORS)
+    np.testing.assert_array_equal(scene.colors, scene_files.COLORS)
 
 
 def test_transforms_intrinsics_of_frames_go_before_those_of_the_file(tmp_path):
@@ -106,9 +92,9 @@ K = ("k1", "k2", "p1", "p2", "k3")
 def test_transforms_with_distortion(tmp_path, model, distort, params, keys):
     lens = (160, 120, 150, 156, 83.2, 58.6)
     values = dict(zip((*LENS, *keys), (*lens, *params), strict=True)) | {"camera_model": model}
-    pixels = distorted_picture(distort, params, *lens)
+    pixels = scene_files.distorted_picture(distort, params, *lens)
     scene, lines = load(write_transforms(tmp_path, ["a.png"], pixels, **values))
-    check_ideal(scene.train[0])
+    scene_files.check_ideal(scene.train[0])
     assert len(lines) == 1 and "Undistorting 1 of 1" in lines[0]
 
 
@@ -125,7 +111,7 @@ FEW = {"camera_model": "OPENCV_FISHEYE", "k1": 0.02, "k2": -0.01, "k3": 0.003}
 )
 def test_native_lenses_keep_the_pixels(tmp_path, values, lens):
     width, height = values.get("w", WIDTH), values.get("h", HEIGHT)
-    pixels = texture(width, height)
+    pixels = scene_files.texture(width, height)
     scene, lines = load(write_transforms(tmp_path, ["a.png"], pixels, **{**LENS, **values}), lens="native")
     camera = scene.train[0].camera
     assert camera.lens == lens and (camera.width, camera.height) == (width, height)
