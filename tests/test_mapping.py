@@ -59,6 +59,23 @@ def test_models_that_share_photographs_are_joined(truth, tmp_path):
     assert [other.num_reg_images() for other in others if not seen.intersection(other.reg_image_ids())] == [6]
 
 
+@pytest.fixture
+def mapped(truth, tmp_path):
+    """Maps the database as photographs are; the models, and what is told."""
+
+    def run():
+        lines: list[str] = []
+        shutil.copy(truth[0], tmp_path)
+        models = mapping.reconstruct(tmp_path / "database.db", tmp_path, tmp_path / "models", CONFIG, lines.append)
+        return models, lines
+
+    return run
+
+
+def unwanted(*_, **__):
+    pytest.fail("this mapping was begun")
+
+
 def torn(model, shift):
     """All photographs of ``model``, the second half of them moved aside."""
     moved = pycolmap.Reconstruction(model)
@@ -110,9 +127,9 @@ def test_pairs_that_may_fit_by_chance_are_left_out(tmp_path):
     assert left == {*sure, (0, 2), (0, 6)}
 
 
-def test_the_better_mapper_is_taken_and_completed(truth, tmp_path, monkeypatch):
+def test_the_better_mapper_is_taken_and_completed(truth, mapped, monkeypatch):
     """Global finds 12, incremental 9 of other photographs: they are joined, and the rest is added."""
-    database, model = truth
+    _, model = truth
 
     def found(numbers):
         return lambda database, root, config, part, **_: part_of(model, part / "0", numbers)
@@ -122,47 +139,38 @@ def test_the_better_mapper_is_taken_and_completed(truth, tmp_path, monkeypatch):
     monkeypatch.setattr(
         mapping, "_map_stepwise", lambda *a, **k: stepwise(*a, **k) if len(a) > 4 else found(range(8, 17))(*a, **k)
     )
-    lines: list[str] = []
-    shutil.copy(database, tmp_path)
-    models = mapping.reconstruct(tmp_path / "database.db", tmp_path, tmp_path / "models", CONFIG, lines.append)
+    models, lines = mapped()
     assert list(models) == [0] and models[0].num_reg_images() == COUNT and farthest(models[0], model) < 1e-4
     assert len(lines) == 1 and "global mapping" in lines[0] and "global 12" in lines[0] and "incremental 9" in lines[0]
 
 
-def test_what_both_mappers_found_apart_is_written_once(truth, tmp_path, monkeypatch):
+def test_what_both_mappers_found_apart_is_written_once(truth, mapped, monkeypatch):
     """Two groups that share nothing, each a model of either mapper."""
-    database, model = truth
 
     def found(database, root, config, part, *start, **_):
         for number, group in enumerate((range(12), range(12, COUNT))):
             if not start:
-                part_of(model, part / str(number), group)
+                part_of(truth[1], part / str(number), group)
 
     monkeypatch.setattr(mapping, "_map_globally", found)
     monkeypatch.setattr(mapping, "_map_stepwise", found)
-    shutil.copy(database, tmp_path)
-    models = mapping.reconstruct(tmp_path / "database.db", tmp_path, tmp_path / "models", CONFIG, print)
+    models, _ = mapped()
     assert [models[number].num_reg_images() for number in sorted(models)] == [12, COUNT - 12]
 
 
-def test_incremental_mapping_is_spared_where_it_could_add_little(truth, tmp_path, monkeypatch):
-    database, model = truth
-    shutil.copy(database, tmp_path)
-    monkeypatch.setattr(mapping, "MANY", COUNT - 1)
-    monkeypatch.setattr(mapping, "_map_stepwise", lambda *a, **k: pytest.fail("incremental mapping was begun"))
-    lines: list[str] = []
+def test_incremental_mapping_is_spared_where_it_could_add_little(truth, mapped, tmp_path, monkeypatch):
     copies: list[Path] = []
-    monkeypatch.setattr(mapping, "leave_out_doubtful", copies.append)
-    models = mapping.reconstruct(tmp_path / "database.db", tmp_path, tmp_path / "models", CONFIG, lines.append)
-    assert models[0].num_reg_images() == COUNT and farthest(models[0], model) < 1e-3
+    for name, value in (("MANY", COUNT - 1), ("_map_stepwise", unwanted), ("leave_out_doubtful", copies.append)):
+        monkeypatch.setattr(mapping, name, value)
+    models, lines = mapped()
+    assert models[0].num_reg_images() == COUNT and farthest(models[0], truth[1]) < 1e-3
     assert "incremental" not in lines[0]
     assert len(copies) == 1 and copies[0].parent != tmp_path and not copies[0].exists()
 
 
-def test_of_as_many_photographs_the_model_that_fits_the_matches_is_taken(truth, tmp_path, monkeypatch):
+def test_of_as_many_photographs_the_model_that_fits_the_matches_is_taken(truth, mapped, monkeypatch):
     """Global mapping registers all and tears the model, so incremental mapping is begun, which is right."""
-    database, model = truth
-    shutil.copy(database, tmp_path)
+    _, model = truth
 
     def found(model):
         return lambda database, root, config, part, **_: part_of(model, part / "0", range(COUNT))
@@ -170,19 +178,15 @@ def test_of_as_many_photographs_the_model_that_fits_the_matches_is_taken(truth, 
     monkeypatch.setattr(mapping, "MANY", COUNT - 1)
     monkeypatch.setattr(mapping, "_map_globally", found(torn(model, (1.0, 2.0, 0.0))))
     monkeypatch.setattr(mapping, "_map_stepwise", found(model))
-    lines: list[str] = []
-    models = mapping.reconstruct(tmp_path / "database.db", tmp_path, tmp_path / "models", CONFIG, lines.append)
+    models, lines = mapped()
     assert farthest(models[0], model) < 1e-6 and "cameras by incremental mapping" in lines[0]
 
 
-def test_a_mapper_that_was_complete_is_not_begun_again(truth, tmp_path, monkeypatch):
-    database, model = truth
-    shutil.copy(database, tmp_path)
-    for name in ("global", "incremental"):
-        part_of(model, tmp_path / "mapping" / name / "0", range(COUNT))
+def test_a_mapper_that_was_complete_is_not_begun_again(truth, mapped, tmp_path, monkeypatch):
     (tmp_path / "models.part").mkdir()  # it was killed then
-    monkeypatch.setattr(mapping, "_map_globally", lambda *a, **k: pytest.fail("global mapping was begun"))
-    monkeypatch.setattr(mapping, "_map_stepwise", lambda *a, **k: pytest.fail("incremental mapping was begun"))
-    models = mapping.reconstruct(tmp_path / "database.db", tmp_path, tmp_path / "models", CONFIG, print)
+    for name, begin in (("global", "_map_globally"), ("incremental", "_map_stepwise")):
+        part_of(truth[1], tmp_path / "mapping" / name / "0", range(COUNT))
+        monkeypatch.setattr(mapping, begin, unwanted)
+    models, _ = mapped()
     assert models[0].num_reg_images() == COUNT
     assert sorted(path.name for path in tmp_path.iterdir()) == ["database.db", "models"]
