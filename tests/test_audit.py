@@ -129,6 +129,16 @@ def importable(monkeypatch):
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([here, os.environ.get("PYTHONPATH", "")]))
 
 
+def rows_of(place, names, pause=0.0, **options):
+    """Of the audit of a renderer, scene by scene."""
+    renderer, rows = Renderer(place, **options), []
+    for row in measure(renderer, {}, scenes=names.split()):
+        rows.append(row)
+        time.sleep(pause)
+    renderer.close()
+    return rows
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("function", "says"),
@@ -141,9 +151,7 @@ def importable(monkeypatch):
     ],
 )
 def test_what_hangs_dies_or_draws_nothing_gets_a_row(importable, function, says):
-    renderer = Renderer(f"wrong_renderer:{function}", limit=1.0 if function == "hangs" else 60.0)
-    rows = list(measure(renderer, {}, scenes=("one", "two")))
-    renderer.close()
+    rows = rows_of(f"wrong_renderer:{function}", "one two", limit=1.0 if function == "hangs" else 60.0)
     assert [says in row.verdict for row in rows] == [True, True]
     assert {row.level for row in rows} <= {"warning", "error"}
 
@@ -158,21 +166,14 @@ def test_parameters_of_the_renderer_itself_want_no_gradients():
 
 @pytest.mark.slow
 def test_what_dies_between_two_answers_ends_no_audit(importable):
-    renderer = Renderer("wrong_renderer:dies_later")
-    rows = []
-    for row in measure(renderer, {}, scenes=("one", "two")):
-        rows.append(row.verdict)
-        time.sleep(0.5)
-    renderer.close()
-    assert len(rows) == 2 and any("ended with 7" in verdict for verdict in rows)
+    rows = rows_of("wrong_renderer:dies_later", "one two", pause=0.5)
+    assert len(rows) == 2 and any("ended with 7" in row.verdict for row in rows)
 
 
 @pytest.mark.slow
 def test_what_refuses_is_asked_again(importable):
-    renderer = Renderer("wrong_renderer:ends_early")
-    verdicts = [row.verdict for row in measure(renderer, {}, scenes=("one", "two", "cloud", "opaque", "faint"))]
-    renderer.close()
-    assert len(verdicts) == 5 and all("refuses: EOFError" in verdict for verdict in verdicts)
+    rows = rows_of("wrong_renderer:ends_early", "one two cloud opaque faint")
+    assert len(rows) == 5 and all("refuses: EOFError" in row.verdict for row in rows)
 
 
 @pytest.mark.long  # it waits for half a minute
@@ -186,17 +187,13 @@ def test_a_page_that_hangs_gets_a_row_and_the_next_scene_is_drawn(tmp_path):
         "file.overrideMimeType('text/plain; charset=x-user-defined'); file.send();"
         "while (file.responseText.includes('vertex 1\\n')); window.show = async () => {};</script>"
     )
-    renderer = Renderer(str(tmp_path / "page.html"))
-    verdicts = [row.verdict for row in measure(renderer, {}, scenes=("one", "two"))]
-    renderer.close()
-    assert "Timeout" in verdicts[0] and verdicts[1] == "draws nothing"
+    first, second = rows_of(str(tmp_path / "page.html"), "one two")
+    assert "Timeout" in first.verdict and second.verdict == "draws nothing"
 
 
 @pytest.mark.slow
 def test_this_renderer_is_as_float64(importable):
-    renderer = Renderer("audit_targets.own:manual")
-    (row,) = measure(renderer, {}, scenes=("cloud",))
-    renderer.close()
+    (row,) = rows_of("audit_targets.own:manual", "cloud")
     assert row.verdict == "as in float64" and row.same and row.runs == RUNS and row.largest < 1e-4
     assert set(row.gradients) == {"means", "quats", "scales", "opacities", "sh", "background"}
     assert max(row.gradients.values()) < 1e-4
@@ -300,12 +297,11 @@ def test_a_program_may_write_an_exr(tmp_path):
         (["ends:draw"], "its process ended with 0"),
     ],
 )
-def test_bad_input_is_one_sentence(arguments, says, capsys, tmp_path, monkeypatch):
+def test_bad_input_is_one_sentence(arguments, says, fails, tmp_path, monkeypatch):
     (tmp_path / "exits.py").write_text("raise SystemExit(3)")
     (tmp_path / "ends.py").write_text("import os; os._exit(0)")
     monkeypatch.syspath_prepend(tmp_path)
-    assert main(["audit", *arguments]) == 1
-    assert says in capsys.readouterr().err
+    assert says in fails("audit", *arguments)
 
 
 @pytest.mark.parametrize("color", [(0.0, 0.0, 0.0), (0.0, 1.0, 0.0), (np.nan, np.nan, np.nan)], ids=str)
