@@ -24,10 +24,15 @@ from warp_splat.training.seams import Setting, Step
 EXTENT = 10.0
 
 
-def setup(count=6, **options):
+def setup(count=6, rows=None, **options):
+    """A model, with these ``rows`` of its parameters; its optimizer and its growth."""
     rng = np.random.default_rng(0)
     config = TrainConfig(**options)
     model = GaussianModel.from_points(rng.uniform(-1, 1, (count, 3)), rng.integers(0, 255, (count, 3)), sh_degree=1)
+    with torch.no_grad():
+        for name, values in (rows or {}).items():
+            table = model.parameters[name]
+            table[:] = torch.as_tensor(values, dtype=torch.float32).reshape(table.shape)
     optimizer = Optimizer(model, config.learn, EXTENT)
     background = torch.full((3,), float(config.data.white_background))
     scene: Any = SimpleNamespace(extent=EXTENT)
@@ -42,14 +47,6 @@ def observe(densifier, gradients, width=100, height=50):
     image = torch.empty(height, width, 3)
     out = SimpleNamespace(means2d=SimpleNamespace(grad=grad), radii=drawn.int() * 7, image=image)
     densifier.observe(out, Step(1, None))
-
-
-def set_rows(model, **rows):
-    with torch.no_grad():
-        for name, values in rows.items():
-            model.parameters[name][:] = torch.as_tensor(values, dtype=torch.float32).reshape(
-                model.parameters[name].shape
-            )
 
 
 def test_initial_scale_is_the_distance_to_three_neighbors():
@@ -76,8 +73,8 @@ def test_gradients_are_averaged_over_views_in_ndc_units():
 
 
 def test_small_ones_are_cloned_and_large_ones_split():
-    model, _, densifier = setup(4)
-    set_rows(model, scales=[[-4.0] * 3, [1.0, -2, -2], [-4.0] * 3, [1.0] * 3], opacities=[0.0] * 4)
+    scales = [[-4.0] * 3, [1.0, -2, -2], [-4.0] * 3, [1.0] * 3]
+    model, _, densifier = setup(4, {"scales": scales, "opacities": [0.0] * 4})
     means, sh = model.parameters["means"].detach().clone(), model.parameters["sh_dc"].detach().clone()
     observe(densifier, [1.0, 1.0, 0.0, 0.0])
     change = densifier.update(600)
@@ -92,40 +89,36 @@ def test_small_ones_are_cloned_and_large_ones_split():
 
 
 def test_faint_ones_are_pruned_and_large_ones_only_after_a_reset():
-    model, _, densifier = setup(4)
-    set_rows(model, opacities=[-6.0, 0, 0, 0], scales=[[-3.0] * 3, [0.1] * 3, [-3.0] * 3, [-3.0] * 3])
+    rows = {"opacities": [-6.0, 0, 0, 0], "scales": [[-3.0] * 3, [0.1] * 3, [-3.0] * 3, [-3.0] * 3]}
+    model, _, densifier = setup(4, rows)
     assert densifier.update(600).pruned == 1 and len(model) == 3
     assert densifier.update(3100).pruned == 1 and len(model) == 2  # exp(0.1) > 0.1 x extent
 
 
 def test_pruning_never_empties_the_scene():
-    model, _, densifier = setup(5)
-    set_rows(model, opacities=[-9.0] * 5)
+    model, _, densifier = setup(5, {"opacities": [-9.0] * 5})
     change = densifier.update(600)
     assert change.refused and change.pruned == 0 and len(model) == 5
 
 
 def test_a_gaussian_that_is_not_finite_is_pruned():
-    model, _, densifier = setup(4)
-    set_rows(model, opacities=[0.0] * 4)
-    with torch.no_grad():
-        model.parameters["scales"][2, 1] = float("nan")
+    scales = [[-3.0] * 3, [-3.0] * 3, [-3.0, np.nan, -3.0], [-3.0] * 3]
+    model, _, densifier = setup(4, {"opacities": [0.0] * 4, "scales": scales})
     densifier.update(600)
     assert len(model) == 3 and all(torch.isfinite(tensor).all() for tensor in model.parameters.values())
 
 
 @pytest.mark.parametrize(("limit", "pruned"), [(0, 0), (6, 2), (7, 0)])
 def test_screen_size_prunes_only_on_request(limit, pruned):
-    model, _, densifier = setup(3, prune_screen_size=limit)
-    set_rows(model, opacities=[0.0] * 3, scales=[[-3.0] * 3] * 3)
+    rows = {"opacities": [0.0] * 3, "scales": [[-3.0] * 3] * 3}
+    model, _, densifier = setup(3, rows, prune_screen_size=limit)
     observe(densifier, [0.0, 0.0, None])  # radius 7 where drawn
     densifier.radius[2] = 1
     assert densifier.update(3100).pruned == pruned and len(model) == 3 - pruned
 
 
 def test_growth_stops_at_the_limit_with_the_largest_gradients():
-    model, _, densifier = setup(6, max_gaussians=8)
-    set_rows(model, scales=[[-4.0] * 3] * 6, opacities=[0.0] * 6)
+    model, _, densifier = setup(6, {"scales": [[-4.0] * 3] * 6, "opacities": [0.0] * 6}, max_gaussians=8)
     means = model.parameters["means"].detach().clone()
     observe(densifier, [1.0, 5.0, 2.0, 4.0, 3.0, 0.0])
     densifier.update(600)
@@ -134,16 +127,17 @@ def test_growth_stops_at_the_limit_with_the_largest_gradients():
 
 
 def test_schedule():
-    model, _, densifier = setup(4)
+    _, _, densifier = setup(4)
     assert densifier.update(500) is None and densifier.update(650) is None and densifier.update(15_000) is None
     assert densifier.update(700) is not None
-    set_rows(model, opacities=[2.0] * 4)
-    densifier.update(3000)
+
+
+@pytest.mark.parametrize(("iteration", "white"), [(3000, False), (500, True)])
+def test_opacities_are_reset(iteration, white):
+    """Over white, also before the set begins to grow."""
+    model, _, densifier = setup(4, {"opacities": [2.0] * 4}, white_background=white)
+    densifier.update(iteration)
     assert torch.allclose(torch.sigmoid(model.parameters["opacities"].detach()), torch.tensor(0.01))
-    white, _, densifier = setup(4, white_background=True)
-    set_rows(white, opacities=[2.0] * 4)
-    densifier.update(500)
-    assert torch.allclose(torch.sigmoid(white.parameters["opacities"].detach()), torch.tensor(0.01))
 
 
 def step(model, optimizer, gradients, radii=None):
@@ -186,8 +180,7 @@ def test_moments_follow_when_rows_are_arranged():
 
 
 def test_densification_arranges_the_set_along_a_curve():
-    model, _, densifier = setup(50)
-    set_rows(model, scales=[[-4.0] * 3] * 50, opacities=[0.0] * 50)
+    model, _, densifier = setup(50, {"scales": [[-4.0] * 3] * 50, "opacities": [0.0] * 50})
     observe(densifier, [1.0] * 50)
     densifier.update(600)
     means = model.parameters["means"].detach()
