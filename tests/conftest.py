@@ -130,6 +130,18 @@ def fails(capsys):
 
 
 @pytest.fixture
+def ran(capsys):
+    """Runs a command that ends well, and returns what it printed."""
+
+    def run(*arguments):
+        capsys.readouterr()
+        assert main([*map(str, arguments)]) == 0
+        return capsys.readouterr().out
+
+    return run
+
+
+@pytest.fixture
 def spoil(monkeypatch):
     """Lets a function change the list of gradients that an autograd function's backward returns."""
 

@@ -15,7 +15,6 @@ from splat_files import small_splats
 from trainings import begin, stepped, steps
 
 from warp_splat.camera import Camera
-from warp_splat.cli import main
 from warp_splat.color import from_srgb, to_srgb
 from warp_splat.errors import InputError
 from warp_splat.formats.exposures import Exposures, read_exposures
@@ -153,19 +152,19 @@ def test_a_held_out_one_is_guessed_where_neighbors_are_alike():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
-def test_pictures_are_exposed_as_their_photographs(kind, tmp_path, fails):
+def test_pictures_are_exposed_as_their_photographs(kind, tmp_path, ran, fails):
     """In the evaluation as by render.py, of train and test views."""
     model = tmp_path / "model"
-    options = ["--exposure", kind, "--vignetting", "--exposure_lr_init", "0.05", "--quiet", "-r", "8"]
-    assert main(["train", "-s", str(SCENE), "--eval", "-m", str(model), "--iterations", "60", *options]) == 0
+    options = f"--eval --iterations 60 --exposure {kind} --vignetting --exposure_lr_init 0.05 --quiet -r 8"
+    ran("train", "-s", SCENE, "-m", model, *options.split())
     before = json.loads((model / "per_view.json").read_text())["ours_60"]
-    assert main(["render", "-m", str(model), "--quiet"]) == 0
+    ran("render", "-m", model, "--quiet")
     assert json.loads((model / "per_view.json").read_text())["ours_60"]["PSNR"] == before["PSNR"]
     path = model / "point_cloud/iteration_60/exposures.json"
     text = path.read_text()
     pictures = [load_png(model / f"{split}/ours_60/renders/00003.png") for split in ("train", "test")]
     path.unlink()
-    assert main(["render", "-m", str(model), "--quiet"]) == 0
+    ran("render", "-m", model, "--quiet")
     plain = [load_png(model / f"{split}/ours_60/renders/00003.png") for split in ("train", "test")]
     assert all((exposed != mean).any() for exposed, mean in zip(pictures, plain, strict=True))
     path.write_text(text.replace('"kind"', '"sort"'))
@@ -248,11 +247,11 @@ def test_light_times_a_number_is_a_gain_of_what_a_screen_shows():
 
 
 @pytest.mark.slow
-def test_inspect_tells_it_beside_exif(faulty, tmp_path, capsys):
+def test_inspect_tells_it_beside_exif(faulty, tmp_path, ran):
     """Two photographs of three have EXIF."""
     folder, truth = faulty
-    assert main(["inspect", str(folder), "-o", str(tmp_path / "page.html")]) == 0
-    line = next(line for line in capsys.readouterr().out.splitlines() if " exposure " in line)
+    said = ran("inspect", folder, "-o", tmp_path / "page.html")
+    line = next(line for line in said.splitlines() if " exposure " in line)
     found = re.fullmatch(
         r"warning +exposure +photographs differ by (\S+) stops .*: (\S+) \((\S+)\) to (\S+) \((\S+)\) in all; EXIF has "
         r"the exposure of 29 of 50, (\S+) stops beside .*; train with --parts exposure\.",
@@ -277,20 +276,18 @@ def trained(tmp_path_factory):
     return folder, file
 
 
-def test_formats_without_them_say_so(trained, tmp_path, capsys):
-    assert main(["convert", str(trained[0]), str(tmp_path / "a.ply")]) == 0
-    assert "how photographs were exposed (--parts exposure), which no format has" in capsys.readouterr().out
+def test_formats_without_them_say_so(trained, tmp_path, ran):
+    said = ran("convert", trained[0], tmp_path / "a.ply")
+    assert "how photographs were exposed (--parts exposure), which no format has" in said
 
 
-def test_render_shows_photographs_as_they_were_taken(trained, capsys, monkeypatch):
+def test_render_shows_photographs_as_they_were_taken(trained, ran, monkeypatch):
     """By a gain on value + 0.055 in float64; and as the mean photograph where there is no file. A bound is before."""
     (folder, file), written = trained, []
     monkeypatch.setattr("warp_splat.rendering.command.write_maps", lambda *_: 0.0)  # test_bound.py looks at maps
     for name in ("exposures.json", "away.json"):
         file.rename(file.with_name(name))
-        assert main(["render", "-m", str(folder), "--bound"]) == 0
-        assert main(["export-html", str(folder), str(folder / "a.html")]) == 0
-        said = capsys.readouterr().out
+        said = ran("render", "-m", folder, "--bound") + ran("export-html", folder, folder / "a.html")
         for sentence in (" (before exposures): ", "The page shows the mean exposure"):
             assert (sentence in said) == (name == "exposures.json")
         written.append([load_png(folder / f"train/ours_6/renders/{place:05d}.png") for place in (0, 1)])

@@ -170,15 +170,20 @@ def test_holes_stay_holes():
     assert (mesh.vertices @ camera_at(0).rotation[2] < 0.3).all()  # nothing behind what is seen
 
 
+def closed(views):
+    """With an inside."""
+    voxels = voxels_of(views, VOXEL)
+    box = torch.cartesian_prod(*(torch.arange(axis.min() - 1, axis.max() + 2, dtype=torch.int32) for axis in voxels.T))
+    return surface_in(box, views, VOXEL, True)
+
+
 @pytest.mark.parametrize("seen", [[0], [0, 5, 10, 15]])
 def test_holes_are_closed(threads, seen):
     """What is seen stays where it was, and has an inside, in box and color as well; for any number of threads."""
     views, found = [ball(index) for index in seen], []
-    voxels = voxels_of(views, VOXEL)
-    box = torch.cartesian_prod(*(torch.arange(axis.min() - 1, axis.max() + 2, dtype=torch.int32) for axis in voxels.T))
     for count in (1, 2):
         threads(count)
-        found.append(surface_in(box, views, VOXEL, True))
+        found.append(closed(views))
     np.testing.assert_equal(*found)
     mesh, opened = (trimesh.Trimesh(*each[:2], process=False) for each in (found[0], surface(views)))
     assert mesh.is_watertight and not opened.is_watertight and mesh.volume > 4
@@ -190,9 +195,7 @@ def test_a_wrong_depth_bores_into_nothing_solid():
     """Of one view, in the middle of a ball."""
     views = [ball(index) for index in range(VIEWS)]
     views[0].depth[20:40, 30:50] = DISTANCE
-    voxels = voxels_of(views, VOXEL)
-    box = torch.cartesian_prod(*(torch.arange(axis.min() - 1, axis.max() + 2, dtype=torch.int32) for axis in voxels.T))
-    found = surface_in(box, views, VOXEL, True)
+    found = closed(views)
     mesh = trimesh.Trimesh(found.vertices, found.faces, process=False)
     assert mesh.volume == pytest.approx(4 / 3 * np.pi, rel=0.03) and np.linalg.norm(found.vertices, axis=1).min() > 0.9
 
@@ -291,58 +294,59 @@ def in_coarse_voxels(monkeypatch):
     monkeypatch.setattr(trimesh.Trimesh, "convex_decomposition", coarse)
 
 
-@pytest.mark.parametrize("ending", ["ply", "glb", "obj"])
-def test_the_command(model, scene, tmp_path, capsys, ending):
-    path, radius, center = model
-    output = tmp_path / f"ball.{ending}"
-    assert main(["mesh", str(path), str(output), "-s", scene, "--voxel", "0.04", "--triangles", "900"]) == 0
-    mesh = trimesh.load(output, force="mesh")
-    vertices = mesh.vertices * ([-1, -1, 1] if ending == "glb" else [1, 1, 1])
+@pytest.fixture
+def meshed(model, scene, tmp_path, ran):
+    """Runs the command with these options; the mesh, and what was said."""
+
+    def run(ending, options):
+        output = tmp_path / f"ball{ending}"
+        said = ran("mesh", model[0], output, "-s", scene, *options.split())
+        return trimesh.load(output, force="mesh"), said
+
+    return run
+
+
+@pytest.mark.parametrize("ending", [".ply", ".glb", ".obj"])
+def test_the_command(model, meshed, ending):
+    _, radius, center = model
+    mesh, said = meshed(ending, "--voxel 0.04 --triangles 900")
+    vertices = mesh.vertices * ([-1, -1, 1] if ending == ".glb" else [1, 1, 1])
     assert np.abs(np.linalg.norm(vertices - center, axis=1) - radius).max() < 0.04
     assert len(mesh.faces) <= 900 and mesh.visual.vertex_colors.shape == (len(vertices), 4)
-    wanted = 255 * from_srgb(np.array(99 / 255), np.where) if ending == "glb" else 99.0  # glTF's are in linear light
+    wanted = 255 * from_srgb(np.array(99 / 255), np.where) if ending == ".glb" else 99.0  # glTF's are in linear light
     assert np.abs(mesh.visual.vertex_colors[:, :3] - wanted).max() <= 1  # the photographs', not the model's
-    assert "triangles" in capsys.readouterr().out
+    assert "triangles" in said
 
 
-def test_the_command_closes_holes(model, scene, tmp_path, capsys, monkeypatch):
+def test_the_command_closes_holes(meshed, monkeypatch):
     """The ball has one below, where no camera is. Where it is in the world, a mesh does not tell."""
     monkeypatch.setattr(Opened, "placed", lambda self: self.file._replace(coordinates={"origin": [1.0, 2.0, 3.0]}))
-    arguments = [str(model[0]), str(tmp_path / "ball.ply"), "-s", scene, "--voxel", "0.04", "--watertight"]
-    assert main(["mesh", *arguments]) == 0
-    assert trimesh.load(tmp_path / "ball.ply", process=False).is_watertight
-    assert "lost: where they are in the world" in capsys.readouterr().out
+    mesh, said = meshed(".ply", "--voxel 0.04 --watertight")
+    assert mesh.is_watertight and "lost: where they are in the world" in said
 
 
-@pytest.mark.parametrize("options", [["--triangles", "200"], ["--watertight"]])
-def test_nothing_lies_outside_of_a_crop(model, scene, tmp_path, options):
+@pytest.mark.parametrize("options", ["--triangles 200", "--watertight"])
+def test_nothing_lies_outside_of_a_crop(model, meshed, options):
     low, high = np.array([-np.inf, -0.1, 0.7]), np.array([0.2, np.inf, 1.2])
-    box = [f"{value}" for value in (*low, *high)]
-    output = tmp_path / "ball.glb"
-    assert main(["mesh", str(model[0]), str(output), "-s", scene, "--voxel", "0.04", *options, "--crop", *box]) == 0
-    vertices = trimesh.load(output, force="mesh").vertices * [-1, -1, 1]
+    vertices = meshed(".glb", f"--voxel 0.04 {options} --crop -inf -0.1 0.7 0.2 inf 1.2")[0].vertices * [-1, -1, 1]
     assert (vertices >= low - 1e-6).all() and (vertices <= high + 1e-6).all() and len(vertices) > 50
     inner = ((vertices > low + 0.05) & (vertices < high - 0.05)).all(1)  # through the cut, cameras look at its back
     assert np.abs(np.linalg.norm(vertices[inner] - model[2], axis=1) - model[1]).max() < 0.05
 
 
-def test_fewer_triangles_than_there_can_be(model, scene, tmp_path, capsys):
-    arguments = [str(model[0]), str(tmp_path / "ball.ply"), "-s", scene, "--voxel", "0.1"]
-    assert main(["mesh", *arguments, "--triangles", "1"]) == 0
-    assert "triangles, the fewest that simplifying comes to" in capsys.readouterr().out
+def test_fewer_triangles_than_there_can_be(meshed):
+    assert "triangles, the fewest that simplifying comes to" in meshed(".ply", "--voxel 0.1 --triangles 1")[1]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("ending", [".obj", ".ply", ".glb"])
 @pytest.mark.usefixtures("in_coarse_voxels")
-def test_convex_pieces(model, scene, tmp_path, ending):
-    path, radius, _center = model
-    arguments = [str(path), str(tmp_path / f"ball{ending}"), "-s", scene, "--triangles", "400"]
-    assert main(["mesh", *arguments, "--collision", "2"]) == 0
+def test_convex_pieces(model, meshed, tmp_path, ending):
+    meshed(ending, "--triangles 400 --collision 2")
     pieces = trimesh.load(tmp_path / f"ball_collision{ending}", force="mesh").split()
     assert 1 <= len(pieces) <= 2 and all(piece.is_convex for piece in pieces)
     volume = sum(piece.volume for piece in pieces)
-    assert volume == pytest.approx(4 / 3 * np.pi * radius**3, rel=0.3)
+    assert volume == pytest.approx(4 / 3 * np.pi * model[1] ** 3, rel=0.3)
 
 
 @pytest.mark.slow
@@ -374,11 +378,10 @@ def test_a_full_disk_loses_no_surface(model, scene, tmp_path, monkeypatch, full)
         (["mesh.ply", "--memory", "1e-9"], "expected views of 16 px and more, found 0; train on larger photographs"),
     ],
 )
-def test_sentences(model, scene, capsys, monkeypatch, tmp_path, arguments, said):
+def test_sentences(model, scene, fails, monkeypatch, tmp_path, arguments, said):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "ball_collision.ply").mkdir()
     (tmp_path / "file").touch()
     (tmp_path / "link.ply").symlink_to(model[0])
     monkeypatch.delattr("warp_splat.meshing.command.filled")  # said before photographs are compared, which takes long
-    assert main(["mesh", str(model[0]), *arguments, "-s", scene]) != 0
-    assert said in capsys.readouterr().err
+    assert said in fails("mesh", model[0], *arguments, "-s", scene)

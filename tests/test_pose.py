@@ -14,7 +14,6 @@ from scipy.spatial.transform import Rotation
 from trainings import begin, state_of, stepped
 
 from warp_splat.camera import Camera
-from warp_splat.cli import main
 from warp_splat.evaluation import alignment
 from warp_splat.evaluation.alignment import find_pose
 from warp_splat.formats.colmap_text import write_colmap as write_model
@@ -192,14 +191,14 @@ def trained(tmp_path_factory):
 
 
 @pytest.mark.parametrize("file", ["", "point_cloud/iteration_24/point_cloud.ply"])
-def test_render_knows_the_cameras(trained, capsys, file):
+def test_render_knows_the_cameras(trained, ran, file):
     """Also where only the file is named, which lies in the folder; its images go beside it."""
     folder, name = (trained / f"{file}.renders", "ours_0") if file else (trained, "ours_24")
     trained_results = json.loads((trained / "results.json").read_text())["ours_24"]
     assert trained_results["PSNR_POSE"] >= trained_results["PSNR"]
     assert "PSNR_POSE" in (trained / "per_view.md").read_text()
-    assert main(["render", "-m", str(trained / file), "--skip_train"]) == 0
-    assert "cameras are those of the model, which were refined with it" in capsys.readouterr().out
+    said = ran("render", "-m", trained / file, "--skip_train")
+    assert "cameras are those of the model, which were refined with it" in said
     results = json.loads((folder / "results.json").read_text())[name]
     for name in ("PSNR", "SSIM"):
         assert results[name] == pytest.approx(trained_results[name], abs=1e-3), name
@@ -245,10 +244,10 @@ def test_lenses_are_written_as_colmap_has_them(model, coefficients, scene, tmp_p
     assert found.original.fx / found.original.width == pytest.approx(camera.fx / camera.width, rel=1e-9)
 
 
-def test_where_cameras_are_refined_no_more_none_are_left(trained, tmp_path):
+def test_where_cameras_are_refined_no_more_none_are_left(trained, tmp_path, ran):
     folder = shutil.copytree(trained, tmp_path / "model")
     assert (ply_path(folder, 24).parent / "cameras.json").exists()
-    assert main(["train", "--resume", str(folder), "--parts", ""]) == 0
+    ran("train", "--resume", folder, "--parts", "")
     assert not (ply_path(folder, 24).parent / "cameras.json").exists()
 
 

@@ -31,6 +31,7 @@ from warp_splat.scene.types import Decoded, View
 
 SIZE = (48, 36)
 OPTIONS = RasterOptions()
+OF_SCENE = {"source_path": str(embedded_scene()), "resolution": 8, "eval": True}
 
 
 def splats_before(camera, count=40, seed=0, depth=(3, 5), scale=-2.0):
@@ -197,35 +198,21 @@ def test_floaters_hang_before_few_cameras():
 def folder(tmp_path_factory):
     """A model of the embedded scene at an eighth of its size: its points, some of them twice."""
     folder = tmp_path_factory.mktemp("model")
-    scene = load_scene(embedded_scene(), resolution=8, eval=True, report=lambda line: None)
+    scene = load_scene(embedded_scene(), resolution=8, eval=True, report=str)
     model = GaussianModel.from_points(scene.points[::4], scene.colors[::4], 2)
     splats = model.splats()
     splats.opacities[:] = 1.0
     save_gaussians(ply_path(folder, 7), SplatFile(splats))
-    write_cfg_args(folder, {"source_path": str(embedded_scene()), "resolution": 8, "eval": True})
+    write_cfg_args(folder, OF_SCENE)
     return folder, splats
 
 
 @pytest.mark.slow
-def test_simplify_to_a_share_with_training(folder, tmp_path, capsys, monkeypatch):
+def test_simplify_to_a_share_with_training(folder, tmp_path, ran, monkeypatch):
     monkeypatch.setattr("warp_splat.pruning.simplify.LEVELS", (1.0, 0.6))
-    folder, splats = folder
+    (folder, splats), output = folder, tmp_path / "small.sog"
     count = len(splats.means)
-    output = tmp_path / "small.sog"
-    arguments = [
-        "simplify",
-        str(ply_path(folder, 7)),
-        "--keep",
-        "0.5",
-        "--steps",
-        "6",
-        "-o",
-        str(output),
-        "--device",
-        "cpu",
-    ]
-    assert main(arguments) == 0
-    out = capsys.readouterr().out
+    out = ran("simplify", ply_path(folder, 7), *"--keep 0.5 --steps 6 --device cpu -o".split(), output)
     assert f"{output}: {round(count / 2)} of {count} Gaussians" in out and "test PSNR" in out and "harmonics: " in out
     assert len(load_gaussians(output).splats.means) == round(count / 2)
     assert (tmp_path / "small.curve.png").stat().st_size > 10_000
@@ -234,53 +221,46 @@ def test_simplify_to_a_share_with_training(folder, tmp_path, capsys, monkeypatch
 
 
 @pytest.mark.long
-def test_simplify_to_a_size_and_to_a_loss(folder, tmp_path, capsys):
+def test_simplify_to_a_size_and_to_a_loss(folder, tmp_path, ran):
     folder, splats = folder
     save_gaussians(tmp_path / "whole.spz", SplatFile(splats))
     size = int(0.7 * (tmp_path / "whole.spz").stat().st_size)
-    arguments = ["simplify", str(folder), "--device", "cpu"]
-    assert main([*arguments, "--size", f"{size / 1000}kB", "-o", str(tmp_path / "a.spz")]) == 0
-    assert 0.9 * size < (tmp_path / "a.spz").stat().st_size <= size
-    assert main([*arguments, "--size", f"{size / 1000}kB", "--steps", "6", "-o", str(tmp_path / "a.spz")]) == 0
-    assert 0.9 * size < (tmp_path / "a.spz").stat().st_size <= size
-    capsys.readouterr()
-    assert main([*arguments, "--max_loss", "0.5", "-o", str(tmp_path / "b.ply")]) == 0
-    said = capsys.readouterr().out
+    arguments = ("simplify", folder, "--device", "cpu")
+    for steps in (0, 6):
+        ran(*arguments, "--size", f"{size / 1000}kB", "--steps", steps, "-o", tmp_path / "a.spz")
+        assert 0.9 * size < (tmp_path / "a.spz").stat().st_size <= size
+    said = ran(*arguments, "--max_loss", 0.5, "-o", tmp_path / "b.ply")
     loss = float(said.split("train PSNR")[1].split("(")[1].split(")")[0])
     assert loss >= -0.5 and len(load_gaussians(tmp_path / "b.ply").splats.means) < len(splats.means)
 
 
-def test_only_what_a_crop_leaves_is_compared(folder, tmp_path, capsys):
+def test_only_what_a_crop_leaves_is_compared(folder, tmp_path, ran, fails):
     """Otherwise what lies around the box is missing in all pictures: figures are far lower."""
     folder, splats = folder
     low, high = (np.quantile(splats.means, share, axis=0) for share in (0.2, 0.8))
     found = {}
-    for name, crop in {"whole": (), "box": ("--crop", *map(str, (*low, *high)))}.items():
-        arguments = ["clean", str(folder), "-o", str(tmp_path / "a.ply"), "--device", "cpu", *crop]
-        assert main(arguments) == 0
-        out = capsys.readouterr().out
+    arguments = ("clean", folder, "-o", tmp_path / "a.ply", "--device", "cpu")
+    for name, crop in {"whole": (), "box": ("--crop", *low, *high)}.items():
+        out = ran(*arguments, *crop)
         found[name] = [float(line.split("PSNR")[1].split()[0]) for line in out.splitlines() if " PSNR " in line]
     assert "of 43 views" in out and found["box"] == pytest.approx(found["whole"], abs=2)
     one = splats.means[0]
-    assert main([*arguments[:-6], *map(str, (*(one - 1e-3), *(one + 1e-3)))]) == 1
-    assert "cover pixels of photographs" in capsys.readouterr().err
+    assert "cover pixels of photographs" in fails(*arguments, "--crop", *(one - 1e-3), *(one + 1e-3))
 
 
 @pytest.mark.parametrize("command", [["simplify", "--keep", "0.9"], ["clean"]], ids=lambda words: words[0])
-def test_what_a_file_has_no_room_for_counts(folder, tmp_path, capsys, monkeypatch, fails, command):
+def test_what_a_file_has_no_room_for_counts(folder, tmp_path, ran, monkeypatch, fails, command):
     """What is said of a .splat is what is there, which has no harmonics, nor a mark of antialiasing."""
     monkeypatch.setattr("warp_splat.pruning.simplify.LEVELS", (1.0,))
-    splats, output = folder[1], tmp_path / "a.splat"
-    sh = splats.sh.copy()
+    splats, output, sh = folder[1], ("-o", tmp_path / "a.splat", "--device", "cpu"), folder[1].sh.copy()
     sh[:, 0] -= 0.5
     sh[:, 2] = -0.6  # brighter from above, where the cameras are
     save_gaussians(ply_path(tmp_path, 7), SplatFile(splats._replace(sh=sh), antialiased=True))
-    write_cfg_args(tmp_path, {"source_path": str(embedded_scene()), "resolution": 8, "eval": True})
-    assert main([*command, str(tmp_path), "-o", str(output), "--device", "cpu"]) == 0
-    out = capsys.readouterr().out
+    write_cfg_args(tmp_path, OF_SCENE)
+    out = ran(*command, tmp_path, *output)
     assert "lost: " in out and "all harmonics, for which such a file has no room" in out
     opened = Opened(FinishedModel(model=str(tmp_path), device="cpu"))
-    whole, left = (load_gaussians(path) for path in (ply_path(tmp_path, 7), output))
+    whole, left = (load_gaussians(path) for path in (ply_path(tmp_path, 7), output[1]))
     before, unlike = (opened.psnr(file.splats, opened.scene.train) for file in (whole, left))
     after = opened.psnr(left.splats, opened.scene.train, OPTIONS)
     assert opened.options.antialiasing and abs(unlike - after) > 0.02
@@ -288,43 +268,34 @@ def test_what_a_file_has_no_room_for_counts(folder, tmp_path, capsys, monkeypatc
     assert before - after > 0.3
     assert (float(told[1]), float(told[2])) == pytest.approx((before, after), abs=0.01)
     for promise in ("--max_loss", "--tolerance"):
-        tried = ["simplify", tmp_path, promise, "0.001", "-o", output, "--device", "cpu"]
-        assert "expected a format with room for harmonics" in fails(*tried)
-    tried = ["simplify", str(tmp_path), "--max_loss", "0.001", "--steps", "2", "-o", str(output), "--device", "cpu"]
-    assert main(tried) == 0 and "That is more than --max_loss" in capsys.readouterr().out
+        assert "expected a format with room for harmonics" in fails("simplify", tmp_path, promise, 0.001, *output)
+    said = ran("simplify", tmp_path, "--max_loss", 0.001, "--steps", 2, *output)
+    assert "That is more than --max_loss" in said
     save_gaussians(ply_path(tmp_path, 7), SplatFile(splats))  # whose harmonics are zeros
-    assert main(["simplify", str(tmp_path), "--tolerance", "0.3", "-o", str(output), "--device", "cpu"]) == 0
-    assert "all harmonics" not in capsys.readouterr().out
+    assert "all harmonics" not in ran("simplify", tmp_path, "--tolerance", 0.3, *output)
 
 
 @pytest.mark.long
-def test_simplify_within_a_tolerance(folder, tmp_path, capsys):
-    folder, splats = folder
-    output = tmp_path / "b.ply"
-    assert main(["simplify", str(folder), "--device", "cpu", "--tolerance", "0.05", "-o", str(output)]) == 0
-    measured, bound = changes_told(capsys.readouterr().out)
-    views = load_scene(embedded_scene(), resolution=8, eval=True, report=lambda line: None).train
-    setting, left = (
-        setting_of([view.camera for view in views], background=(0.0, 0.0, 0.0)),
-        load_gaussians(output).splats,
-    )
+def test_simplify_within_a_tolerance(folder, tmp_path, ran):
+    (folder, splats), output = folder, tmp_path / "b.ply"
+    measured, bound = changes_told(ran("simplify", folder, "--device", "cpu", "--tolerance", 0.05, "-o", output))
+    views, left = load_scene(embedded_scene(), resolution=8, eval=True, report=str).train, load_gaussians(output).splats
+    setting = setting_of([view.camera for view in views], background=(0.0, 0.0, 0.0))
     changes = [(drawn(splats, setting, v.camera) - drawn(left, setting, v.camera)).abs().max() for v in views]
     assert max(changes) == pytest.approx(measured, rel=0.1) and measured <= bound <= 0.05
     assert len(left.means) < len(splats.means)
 
 
 @pytest.mark.parametrize("gone", ["", "/nowhere/scene"])
-def test_simplify_without_a_scene_keeps_the_opaque_and_large(tmp_path, capsys, gone):
+def test_simplify_without_a_scene_keeps_the_opaque_and_large(tmp_path, ran, gone):
     """Also a file in a model's folder whose scene is not there."""
     path = ply_path(tmp_path, 1) if gone else tmp_path / "a.ply"
     if gone:
         write_cfg_args(tmp_path, {"source_path": gone})
-    camera = make_camera(*SIZE, seed=3)
-    splats = splats_before(camera)
+    splats = splats_before(make_camera(*SIZE, seed=3))
     splats.opacities[::2] = -5
     save_gaussians(path, SplatFile(splats))
-    assert main(["simplify", str(path), "--keep", "0.5", "-o", str(tmp_path / "b.glb")]) == 0
-    assert "Without a scene" in capsys.readouterr().out
+    assert "Without a scene" in ran("simplify", path, "--keep", 0.5, "-o", tmp_path / "b.glb")
     np.testing.assert_allclose(load_gaussians(tmp_path / "b.glb").splats.means, splats.means[1::2], atol=1e-6)
 
 
@@ -353,21 +324,18 @@ def test_simplify_refuses_in_one_sentence(tmp_path, fails, monkeypatch, options,
     assert [path.name for path in tmp_path.iterdir()] == ["a.ply"]
 
 
-def test_clean_reports_before_and_after(folder, tmp_path, capsys):
+def test_clean_reports_before_and_after(folder, tmp_path, ran):
     """With a dark Gaussian planted right before the first training camera."""
     folder, splats = folder
-    camera = load_scene(embedded_scene(), resolution=8, eval=True, report=lambda line: None).train[0].camera
+    camera = load_scene(embedded_scene(), resolution=8, eval=True, report=str).train[0].camera
     planted = concatenated([splats, splats.take(slice(1))])
     planted.means[-1] = np.float32([0, 0, 0.3]) @ camera.rotation + camera.center
     planted.sh[-1, 0], planted.scales[-1], planted.opacities[-1] = -0.5 / C0, -2.5, 5.0
-    output = tmp_path / "b.spz"
-    copy = tmp_path / "model"
+    output, copy = tmp_path / "b.spz", tmp_path / "model"
     save_gaussians(ply_path(copy, 7), SplatFile(planted))
-    write_cfg_args(copy, {"source_path": str(embedded_scene()), "resolution": 8, "eval": True})
+    write_cfg_args(copy, OF_SCENE)
     write_coordinates(copy, {"origin": [1.0, 2.0, 3.0]})
-    arguments = ["clean", str(copy), "-o", str(output), "--device", "cpu"]
-    assert main(arguments) == 0
-    out = capsys.readouterr().out
+    out = ran("clean", copy, "-o", output, "--device", "cpu")
     assert re.search("lost: .*where they are in the world", out)
     left = int(out.split(f"{output}: ")[1].split(" of ")[0])
     assert len(planted.means) - 20 < left < len(planted.means)
