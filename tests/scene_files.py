@@ -44,10 +44,7 @@ def radial(x, y, k1, k2=0.0, p1=0.0, p2=0.0, k3=0.0, k4=0.0, k5=0.0, k6=0.0):
     """COLMAP's (and OpenCV's) radial and tangential distortion of normalized coordinates; OpenCV's rational model."""
     r2 = x * x + y * y
     factor = (1 + k1 * r2 + k2 * r2**2 + k3 * r2**3) / (1 + k4 * r2 + k5 * r2**2 + k6 * r2**3)
-    return (
-        x * factor + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-        y * factor + 2 * p2 * x * y + p1 * (r2 + 2 * y * y),
-    )
+    return (x * factor + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * factor + 2 * p2 * x * y + p1 * (r2 + 2 * y * y))
 
 
 def fisheye(x, y, k1=0.0, k2=0.0, k3=0.0, k4=0.0):

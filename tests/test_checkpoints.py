@@ -352,8 +352,7 @@ def run_main(arguments):
 
 
 @pytest.mark.parametrize(
-    ("most", "iterations"),
-    [pytest.param(4, 60, marks=pytest.mark.slow), pytest.param(50, 300, marks=pytest.mark.long)],
+    ("most", "iterations"), [pytest.param(4, 60, marks=pytest.mark.slow), pytest.param(50, 300, marks=pytest.mark.long)]
 )
 @forked
 def test_a_training_that_is_killed_again_and_again_ends_in_the_same_bytes(most, iterations, tmp_path):

@@ -215,10 +215,7 @@ def test_distances_give_the_scale_and_cameras_the_up_and_unknown_names_are_told(
         ("name,other,distance\n0.jpg,1.jpg,-3", "distances above 0"),
         ("name,other,distance\n0.jpg,1.jpg,1\n1.jpg,2.jpg,1e3\n2.jpg,3.jpg,1e6", "found 100% off"),
         ("name,other,distance\n0.jpg,0.jpg,3", "distances above 0"),
-        (
-            "name,x,y,z\n" + "\n".join(f"{k}.jpg,{k**3 % 7},{k**5 % 11},{k**2 % 5}" for k in range(COUNT)),
-            "fit the cam",
-        ),
+        ("name,x,y,z\n" + "\n".join(f"{k}.jpg,{k**3 % 7},{k**5 % 11},{k**2 % 5}" for k in range(COUNT)), "fit the cam"),
     ],
 )
 def test_files_that_do_not_fit_get_one_sentence(tmp_path, text, words):

@@ -180,10 +180,7 @@ def write_exr(path, channels, size=(WIDTH, HEIGHT)):
         ("Y A Z", [1, 1, 1]),
         ("Red Green Blue", [1, 2, 3]),
         ("R G B matte.B", [1, 2, 3]),
-        (
-            "Albedo.R Albedo.G Albedo.B L.R L.G L.B L.A",
-            "R, G, B of one layer, found Albedo",
-        ),
+        ("Albedo.R Albedo.G Albedo.B L.R L.G L.B L.A", "R, G, B of one layer, found Albedo"),
         ("a.red a.green a.blue b.red b.green b.blue", "expected R, G, B of one layer"),
         ("N.X N.Y N.Z", "expected R, G, B of one layer"),
         ("RY BY Y", "expected R, G, B of one layer"),

@@ -168,10 +168,7 @@ def test_refused_in_one_sentence(tmp_path, monkeypatch):
     UsdGeom.Xformable(add(stage, "/a", some_splats(3))).AddScaleOp().Set((1, 2, 1))
     stage.Save()
     refuse("stretches or shears")
-    for key, value, sentence in (
-        ("upAxis", '"X"', "one whose axis X is up"),
-        ("metersPerUnit", "0", "units of 0 m"),
-    ):
+    for key, value, sentence in (("upAxis", '"X"', "one whose axis X is up"), ("metersPerUnit", "0", "units of 0 m")):
         path.write_text(f'#usda 1.0\n({key} = {value})\ndef ParticleField3DGaussianSplat "a" {{}}\n')
         refuse(sentence)
     path.write_text("#usda 1.0\n( garbage")

@@ -88,8 +88,7 @@ def test_needle_keeps_its_digits():
 
 
 @pytest.mark.parametrize(
-    ("integrate", "steps", "tolerance"),
-    [*zip(INTEGRATORS, (3, 20000, 200), (1e-14, 1e-4, 1e-10), strict=True)],
+    ("integrate", "steps", "tolerance"), [*zip(INTEGRATORS, (3, 20000, 200), (1e-14, 1e-4, 1e-10), strict=True)]
 )
 def test_constant_medium(integrate, steps, tolerance):
     """And an empty one, which shows the background."""
