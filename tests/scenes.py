@@ -143,9 +143,8 @@ def needles(stretch=1):
     half = np.linspace(0, np.pi, count, endpoint=False) / 2
     quats = np.stack([np.cos(half), 0 * half, 0 * half, np.sin(half)], 1)
     quats[::6] = rng.normal(size=quats[::6].shape)
-    return pack(
-        at_pixels(pixels, z, camera), scales, rng.uniform(0.3, 0.9, count), colors(rng, count, 0), camera, rng, quats
-    )
+    opacities, sh = rng.uniform(0.3, 0.9, count), colors(rng, count, 0)
+    return pack(at_pixels(pixels, z, camera), scales, opacities, sh, camera, rng, quats)
 
 
 def pancakes():
@@ -217,10 +216,7 @@ def _clouds(degree):
 
 
 SCENES = {
-    "degree0": _clouds(0),
-    "degree1": _clouds(1),
-    "degree2": _clouds(2),
-    "degree3": _clouds(3),
+    **{f"degree{degree}": _clouds(degree) for degree in range(4)},
     "off_center": lambda: cloud(1, 120, make_camera(50, 31, fx=60, fy=41, cx=38.3, cy=7.2, seed=5), degree=1),
     "principal_outside": lambda: cloud(2, 120, make_camera(40, 24, cx=-25.5, cy=44.2, seed=6), degree=1),
     "focal_ratio": lambda: cloud(3, 100, make_camera(45, 38, fx=33, fy=101, seed=7), degree=1, sigma=(0.5, 3)),

@@ -131,22 +131,14 @@ def check_gradients(gradients, expected):
 
 
 VARIANTS = [
-    ("degree2", RasterOptions(depth=True)),
-    ("inside", RasterOptions(depth=True)),
-    ("opaque", RasterOptions(depth=True)),
-    ("empty", RasterOptions(depth=True)),
-    ("layers_4000", RasterOptions(depth=True)),
-    ("degree2", RasterOptions(antialiasing=True)),
-    ("subpixel", RasterOptions(antialiasing=True)),
-    ("near_and_behind", RasterOptions(antialiasing=True)),
+    *((name, RasterOptions(depth=True)) for name in ("degree2", "inside", "opaque", "empty", "layers_4000")),
+    *((name, RasterOptions(antialiasing=True)) for name in ("degree2", "subpixel", "near_and_behind")),
     ("off_center", RasterOptions(antialiasing=True, depth=True)),
     *(("degree3", RasterOptions(sh_degree=degree)) for degree in (0, 1, 2)),
     ("degree2", RasterOptions(sh_degree=3)),
-    ("degree2", RasterOptions(projection="ellipsoid")),
+    *((name, RasterOptions(projection="ellipsoid")) for name in ("degree2", "needles", "near_and_behind")),
     ("inside", RasterOptions(projection="ellipsoid", depth=True)),
-    ("needles", RasterOptions(projection="ellipsoid")),
     ("off_center", RasterOptions(projection="ellipsoid", antialiasing=True)),
-    ("near_and_behind", RasterOptions(projection="ellipsoid")),
     ("fisheye", RasterOptions(projection="unscented", antialiasing=True, depth=True)),
     ("saturated", RasterOptions(alpha_max=0.999)),
     ("near_and_behind", RasterOptions(near=0.01, blur=0.1, antialiasing=True)),
@@ -198,13 +190,8 @@ def test_gradients_of_needles_err_by_the_square_of_how_long_they_are(device):
     camera, random = Camera(256, 256, 256, 256, 128, 128, np.eye(3), np.zeros(3)), np.random.default_rng(0)
     for long in (0.1, 0.4, 1.6):
         turn = random.uniform(0, np.pi / 2)
-        numbers = (
-            [(0.1, 0.2, 4)],
-            [(np.cos(turn), 0, 0, np.sin(turn))],
-            [(4 * long, 0.005, 0.005)],
-            [0.8],
-            [[(1, 1, 1)]],
-        )
+        quat, scales = (np.cos(turn), 0, 0, np.sin(turn)), (4 * long, 0.005, 0.005)
+        numbers = [(0.1, 0.2, 4)], [quat], [scales], [0.8], [[(1, 1, 1)]]
         given = [torch.tensor(number, dtype=torch.float32, device=device).requires_grad_() for number in numbers]
         exact = [tensor.detach().cpu().double().requires_grad_() for tensor in given]
         out = warp_splat.rasterize(*given, camera)
