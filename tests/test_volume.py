@@ -111,16 +111,19 @@ def test_single_gaussian_is_its_color_at_its_depth():
     assert physics.integrate_exact(profile, volume.colors, BACKGROUND) == pytest.approx(expected, abs=1e-14)
 
 
+def radiance(medium, far, method, **allowed):
+    """By a solver of SciPy's, from the far end to the camera."""
+
+    def toward_camera(q, radiance):
+        tau, source = medium(np.array([far - q]))
+        return source[0, 0] - tau[0, 0] * radiance
+
+    return solve_ivp(toward_camera, (0, far), BACKGROUND, method=method, **allowed).y[:, -1]
+
+
 @pytest.mark.parametrize(("integrate", "order"), list(zip(INTEGRATORS, (2, 1, 4), strict=True)))
 def test_orders(integrate, order):
-    truth = solve_ivp(
-        lambda q, c: wavy(np.array([3 - q]))[1][0, 0] - wavy(np.array([3 - q]))[0][0] * c,
-        (0, 3),
-        BACKGROUND,
-        method="DOP853",
-        rtol=1e-13,
-        atol=1e-14,
-    ).y[:, -1]
+    truth = radiance(wavy, 3, "DOP853", rtol=1e-13, atol=1e-14)
     errors = [np.abs(integrate(wavy, 0.0, 3.0, n, BACKGROUND)[0] - truth).max() for n in (32, 64, 128)]
     slopes = np.log2(errors[:-1]) - np.log2(errors[1:])
     assert slopes == pytest.approx([order, order], abs=0.15)
@@ -129,17 +132,10 @@ def test_orders(integrate, order):
 @pytest.mark.parametrize(("optical_depth", "method"), [(3.0, "LSODA"), (3.0, "Radau"), (1e4, "Radau"), (1e6, "Radau")])
 def test_truth_against_a_stiff_solver(optical_depth, method):
     profile, volume = measure.stiff_medium(optical_depth, rays=1)
-    medium = profile.medium(volume.colors)
-
-    def toward_camera(q, radiance):
-        tau, source = medium(np.array([measure.FAR - q]))
-        return source[0, 0] - tau[0, 0] * radiance
-
-    solution = solve_ivp(
-        toward_camera, (0, measure.FAR), BACKGROUND, method=method, rtol=1e-9, atol=1e-11, max_step=0.5
-    )
+    allowed = {"rtol": 1e-9, "atol": 1e-11, "max_step": 0.5}
+    found = radiance(profile.medium(volume.colors), measure.FAR, method, **allowed)
     truth = physics.integrate_exact(profile, volume.colors, BACKGROUND)[0]
-    assert solution.y[:, -1] == pytest.approx(truth, abs=1e-6)
+    assert found == pytest.approx(truth, abs=1e-6)
 
 
 def test_dense_media_leave_only_the_exponential_alive():
@@ -177,9 +173,8 @@ def test_thin_far_separate_gaussians_are_splats():
         colors=rng.uniform(0, 1, (6, 3)),
         background=BACKGROUND,
     )
-    volume = Volume(
-        **{**vars(volume), "densities": 1e-3 / physics.peak_depths(volume, camera)}  # optical depth 1e-3 each
-    )
+    densities = 1e-3 / physics.peak_depths(volume, camera)  # optical depth 1e-3 each
+    volume = Volume(**{**vars(volume), "densities": densities})
     truth = physics.render_volume(volume, camera)
     assert np.abs(truth - BACKGROUND).max() > 2e-4
     images = physics.splat_ladder(volume, camera)
@@ -190,14 +185,11 @@ def test_thin_far_separate_gaussians_are_splats():
 
 def test_overlap_is_what_the_first_rung_ignores():
     camera = make_camera(5, 5, fx=10, seed=None)
-    apart, close = (
-        Volume([[0, 0, 4], [0, 0, z]], [[1, 0, 0, 0]] * 2, [[0.4] * 3] * 2, [3, 3], np.eye(3)[:2], [0] * 3)
-        for z in (12.0, 4.1)
-    )
-    errors = [
-        np.abs(physics.splat_ladder(volume, camera)["no overlap"] - physics.render_volume(volume, camera)).max()
-        for volume in (apart, close)
-    ]
+    turns, sizes, black = [[1, 0, 0, 0]] * 2, [[0.4] * 3] * 2, [0] * 3
+    pairs = [Volume([[0, 0, 4], [0, 0, z]], turns, sizes, [3, 3], np.eye(3)[:2], black) for z in (12.0, 4.1)]
+    alone = [physics.splat_ladder(volume, camera)["no overlap"] for volume in pairs]
+    whole = [physics.render_volume(volume, camera) for volume in pairs]
+    errors = [np.abs(one - other).max() for one, other in zip(alone, whole, strict=True)]
     assert errors[0] < 1e-12 and errors[1] > 0.1
 
 
