@@ -111,37 +111,30 @@ def spoil(old, new, name=BLOCK):
     return lambda folder: replace(folder / "1" / name, old.encode(), new.encode())
 
 
-#: What a merge finds: the numbers of the blocks, and what is wrong with them.
+#: What a merge finds: the numbers of the blocks, where they are not 0 and 1, and what is wrong with these.
+NUMBERS = {"found none": (), "found 0 of block 2/2": (0,), "found 2 of block 1/2, 0 of block 2/2": (0, "00")}
 WRONG = {
-    "found none": ((), None),
-    "found another model": ((0, 1), lambda folder: (folder / LAST).touch()),
-    "trainings by --block, found another model": (
-        (0, 1),
-        lambda folder: shutil.copytree(folder / "1" / "point_cloud", folder / "point_cloud"),
+    "found another model": lambda folder: (folder / LAST).touch(),
+    "trainings by --block, found another model": lambda folder: shutil.copytree(
+        folder / "1" / "point_cloud", folder / "point_cloud"
     ),
-    "found 0 of block 2/2": ((0,), None),
-    "found 2 of block 1/2, 0 of block 2/2": ((0, "00"), None),
-    "expected the number of blocks of": ((0, 1), spoil('"cells": [', '"cells": [[[0, 0, 0], [1, 1, 1]], ')),
-    "expected the cells of": ((0, 1), spoil("3.4", "3.1")),
-    "expected the antialiasing of": ((0, 1), spoil("antialiasing=False", "antialiasing=True", "cfg_args")),
-    "expected the sh_degree of": ((0, 1), spoil("sh_degree=3", "sh_degree=2", "cfg_args")),
-    "expected the eval of": ((0, 1), spoil("eval=True", "eval=False", "cfg_args")),
-    "expected the origin of": ((0, 1), lambda folder: write_coordinates(folder / "1", {"origin": [1.0, 2.0, 3.0]})),
-    "cfg_args: could not be read (No such file or directory)": (
-        (0, 1),
-        lambda folder: (folder / "1" / "cfg_args").unlink(),
-    ),
-    "expected a block as training writes it": ((0, 1), spoil('"number"', '"numbers"')),
-    "expected cameras as training writes them": ((0, 1), spoil('"img_name"', '"image"', "cameras.json")),
+    "expected the number of blocks of": spoil('"cells": [', '"cells": [[[0, 0, 0], [1, 1, 1]], '),
+    "expected the cells of": spoil("3.4", "3.1"),
+    "expected the antialiasing of": spoil("antialiasing=False", "antialiasing=True", "cfg_args"),
+    "expected the sh_degree of": spoil("sh_degree=3", "sh_degree=2", "cfg_args"),
+    "expected the eval of": spoil("eval=True", "eval=False", "cfg_args"),
+    "expected the origin of": lambda folder: write_coordinates(folder / "1", {"origin": [1.0, 2.0, 3.0]}),
+    "cfg_args: could not be read (No such file or directory)": lambda folder: (folder / "1" / "cfg_args").unlink(),
+    "expected a block as training writes it": spoil('"number"', '"numbers"'),
+    "expected cameras as training writes them": spoil('"img_name"', '"image"', "cameras.json"),
 }
 
 
-@pytest.mark.parametrize("found", WRONG)
+@pytest.mark.parametrize("found", [*NUMBERS, *WRONG])
 def test_a_merge_says_what_is_wrong(found, trained, tmp_path, fails):
-    numbers, spoiled = WRONG[found]
-    put(trained, tmp_path, *numbers)
-    if spoiled:
-        spoiled(tmp_path)
+    put(trained, tmp_path, *NUMBERS.get(found, (0, 1)))
+    if found in WRONG:
+        WRONG[found](tmp_path)
     assert found in fails("merge", tmp_path)
 
 

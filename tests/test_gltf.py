@@ -47,10 +47,8 @@ def test_gltf_holds_what_the_extension_says(tmp_path, ending):
 def test_gltf_of_any_name_finds_its_buffer(tmp_path, name):
     save_gaussians(tmp_path / f"{name}.gltf", some_file(3), report=silent)
     (buffer,) = json.loads((tmp_path / f"{name}.gltf").read_text())["buffers"]
-    assert (
-        not {"#", " "} & {*buffer["uri"]}
-        and len(load_gaussians(tmp_path / f"{name}.gltf", report=silent).splats.means) == 3
-    )
+    assert not {"#", " "} & {*buffer["uri"]}
+    assert len(load_gaussians(tmp_path / f"{name}.gltf", report=silent).splats.means) == 3
 
 
 def place(tmp_path, nodes, **more):
@@ -105,20 +103,17 @@ def test_gltf_quantized_attributes(tmp_path):
     data = rows.tobytes() + np.float32([[1, 2, 3], [4, 5, 6]]).tobytes()
     kinds = {"POSITION": (0, 5122, "VEC3", False), f"{NAME}:ROTATION": (8, 5120, "VEC4", True)}
     kinds |= {f"{NAME}:SCALE": (12, 5123, "VEC3", False), f"{NAME}:OPACITY": (18, 5121, "SCALAR", True)}
-    accessors = [
-        {"bufferView": 0, "byteOffset": o, "componentType": c, "type": t, "normalized": n, "count": 2}
-        for o, c, t, n in kinds.values()
-    ]
+    names = ("byteOffset", "componentType", "type", "normalized")
+    accessors = [dict(zip(names, kind, strict=True)) | {"bufferView": 0, "count": 2} for kind in kinds.values()]
     accessors.append({"bufferView": 1, "componentType": 5126, "type": "VEC3", "count": 2})
     attributes = {name: index for index, name in enumerate([*kinds, f"{NAME}:SH_DEGREE_0_COEF_0"])}
+    primitive = {"mode": 0, "attributes": attributes, "extensions": {NAME: {"kernel": "ellipse"}}}
     document = {
         "asset": {"version": "2.0"},
         "extensionsUsed": [NAME, "KHR_mesh_quantization"],
         "extensionsRequired": ["KHR_mesh_quantization"],
         "nodes": [{"mesh": 0}],
-        "meshes": [
-            {"primitives": [{"mode": 0, "attributes": attributes, "extensions": {NAME: {"kernel": "ellipse"}}}]}
-        ],
+        "meshes": [{"primitives": [primitive]}],
         "accessors": accessors,
         "bufferViews": [
             {"buffer": 0, "byteLength": rows.nbytes, "byteStride": rows.itemsize},

@@ -145,56 +145,52 @@ def two_of_one_stem(path):
 
 
 @pytest.mark.parametrize(
-    ("damage", "finding", "text"),
+    ("damage", "told"),
     [
-        (in_photo(Path.unlink), ("error", "files"), "view_003.png"),
-        (in_photo(two_of_one_stem), ("error", "files"), "several of this stem (view_003.jpg, view_003.tif)"),
-        (in_photo(lambda path: write_image(path, texture(200, 264))), ("error", "sizes"), "264 x 248"),
-        (in_photo(lambda path: path.write_bytes(path.read_bytes()[:9000])), ("error", "files"), "view_003.png"),
+        (in_photo(Path.unlink), "error files: view_003.png"),
+        (in_photo(two_of_one_stem), "error files: several of this stem (view_003.jpg, view_003.tif)"),
+        (in_photo(lambda path: write_image(path, texture(200, 264))), "error sizes: 264 x 248"),
+        (in_photo(lambda path: path.write_bytes(path.read_bytes()[:9000])), "error files: view_003.png"),
         (
             in_photo(lambda path: shutil.copy(path, path.with_name("view_004.png"))),
-            ("warning", "duplicates"),
-            "view_003.png = view_004.png",
+            "warning duplicates: view_003.png = view_004.png",
         ),
-        (in_photo(lambda path: write_image(path, 0 * texture(264, 248))), ("warning", "contents"), "1 of 50"),
-        (in_photo(lambda path: write_image(path, texture(264, 248, 4))), ("warning", "alpha"), "1 of 50"),
+        (in_photo(lambda path: write_image(path, 0 * texture(264, 248))), "warning contents: 1 of 50"),
+        (in_photo(lambda path: write_image(path, texture(264, 248, 4))), "warning alpha: 1 of 50"),
         (
             lambda s: write_image(s / "masks" / "view_003.png.png", texture(264, 248, 1)),
-            ("warning", "masks"),
-            "masks for 1 of 50",
+            "warning masks: masks for 1 of 50",
         ),
-        (lambda s: shutil.copytree(s / "sparse/0", s / "sparse/1"), ("warning", "sub-models"), "sparse/1"),
+        (lambda s: shutil.copytree(s / "sparse/0", s / "sparse/1"), "warning sub-models: sparse/1"),
         (
             in_model(lambda model: [model.delete_point3D(n) for n in list(model.points3D)]),
-            ("warning", "points"),
-            "random ones",
+            "warning points: random ones",
         ),
         (
             in_model(lambda model: setattr(model.cameras[1], "params", (30.0, 30.0, 130, 125))),
-            ("error", "reprojection"),
-            "do not belong together",
+            "error reprojection: do not belong together",
         ),
         (
             in_poses(lambda pose: pycolmap.Rigid3d(pose.rotation, pose.translation + ASIDE), 3),
-            ("warning", "reprojection"),
-            "1 images are much worse",
+            "warning reprojection: 1 images are much worse",
         ),
-        (in_poses(lambda pose: FLIP * pose), ("error", "axes"), "with OpenGL axes"),
-        (in_poses(lambda pose: pose.inverse()), ("error", "axes"), "with camera-to-world the"),
-        (in_points(9, (1e6, 0, 0)), ("warning", "points"), "9 of 4500"),
-        (in_points(9, (1e38, 0, 0)), ("warning", "points"), "9 of 4500"),  # squares do not fit into 32 bits
-        (in_points(9, (1e300, 0, 0)), ("warning", "points"), "9 of 4500 are not finite in 32 bits"),
-        (in_points(900, (0, 0, 40)), ("warning", "unseen points"), "20.0 %"),
+        (in_poses(lambda pose: FLIP * pose), "error axes: with OpenGL axes"),
+        (in_poses(lambda pose: pose.inverse()), "error axes: with camera-to-world the"),
+        (in_points(9, (1e6, 0, 0)), "warning points: 9 of 4500"),
+        (in_points(9, (1e38, 0, 0)), "warning points: 9 of 4500"),  # squares do not fit into 32 bits
+        (in_points(9, (1e300, 0, 0)), "warning points: 9 of 4500 are not finite in 32 bits"),
+        (in_points(900, (0, 0, 40)), "warning unseen points: 20.0 %"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
-def test_damage_is_found(life, tmp_path, capsys, monkeypatch, damage, finding, text):
+def test_damage_is_found(life, tmp_path, capsys, monkeypatch, damage, told):
+    finding, _, text = told.partition(": ")
     monkeypatch.setattr(command, "draw_pictures", lambda subject: ())  # takes long
-    if finding[1] != "points":  # which the steps of a trial are tried on, too
+    if finding != "warning points":  # which the steps of a trial are tried on, too
         monkeypatch.setattr(command, "check_cost", lambda *_: ())
     damage(life)
-    findings, _ = examine(life, tmp_path, capsys, 1 if finding[0] == "error" else 0)
-    assert any(text in what for *found, what in findings if tuple(found) == finding), findings
+    findings, _ = examine(life, tmp_path, capsys, 1 if finding.startswith("error") else 0)
+    assert any(text in what for level, check, what in findings if f"{level} {check}" == finding), findings
 
 
 @pytest.mark.parametrize("case", BAD)

@@ -80,12 +80,8 @@ def test_a_thumbnail_never_decides_that_a_mask_covers_all(tmp_path, monkeypatch,
     width, height, widths = 160, 120, []
     masks = {name: np.zeros((height, width, 1), np.uint8) for name in ("black", "corner", "large", "small")}
     masks["large"][30:90, 40:120] = masks["small"][56:60, 70:74] = masks["corner"][0, 0] = 255
-    root = write_colmap(
-        tmp_path,
-        [f"{name}.png" for name in masks],
-        texture(width, height),
-        camera=f"OPENCV {width} {height} 150 150 80 60 -0.15 0.04 0 0",
-    )
+    lens = f"OPENCV {width} {height} 150 150 80 60 -0.15 0.04 0 0"
+    root = write_colmap(tmp_path, [f"{name}.png" for name in masks], texture(width, height), camera=lens)
     for name, mask in masks.items():
         write_image(root / "masks" / f"{name}.png", mask)
     monkeypatch.setattr(images, "read_counts", lambda *of: widths.append(of[1].width) or read_counts(*of))

@@ -14,7 +14,6 @@ from scipy.spatial.transform import Rotation
 from splat_files import some_file, some_splats
 
 from warp_splat.camera import Camera
-from warp_splat.cli import main
 from warp_splat.errors import InputError
 from warp_splat.formats import model_folder
 from warp_splat.formats.coordinates import write_coordinates
@@ -23,16 +22,9 @@ from warp_splat.formats.splats import SplatFile
 from warp_splat.scene.start import load_start
 from warp_splat.scene.types import Decoded, View
 
-ARGUMENTS = {
-    "sh_degree": 3,
-    "source_path": "a folder/it's",
-    "model_path": Path("output") / "x",
-    "white_background": False,
-    "test_iterations": [7000, 30000],
-    "position_lr_init": 1.6e-4,
-    "offset": -1,
-    "start_checkpoint": None,
-}
+ARGUMENTS = {"sh_degree": 3, "source_path": "a folder/it's", "model_path": Path("output") / "x"}
+ARGUMENTS |= {"white_background": False, "test_iterations": [7000, 30000], "position_lr_init": 1.6e-4}
+ARGUMENTS |= {"offset": -1, "start_checkpoint": None}
 
 
 def test_cfg_args_are_what_argparse_prints_and_come_back(tmp_path):
@@ -203,7 +195,7 @@ def test_default_model_path_is_new_each_time():
 
 
 @pytest.mark.parametrize("mark", [False, True])
-def test_open_model(tmp_path, mark, monkeypatch, fails, capsys):
+def test_open_model(tmp_path, mark, monkeypatch, fails, ran):
     """cfg_args goes before the file's own mark of antialiasing, which goes before nothing; convert does likewise."""
     folder, target = tmp_path / "model", tmp_path / "a.spz"
     for iteration in (3, 20):
@@ -212,7 +204,8 @@ def test_open_model(tmp_path, mark, monkeypatch, fails, capsys):
     told = {"antialiasing": mark, "linear_light": False}
     assert (iteration, len(file.splats.means), options) == (20, 20, {"eval": True, **told})
     assert model_folder.open_model(model_folder.ply_path(folder, 3))[::2] == (0, options)
-    assert main(["convert", str(folder), str(target)]) == 0 and load_gaussians(target).antialiased == mark
+    ran("convert", folder, target)
+    assert load_gaussians(target).antialiased == mark
     monkeypatch.chdir(write_colmap(tmp_path / "scene"))  # which it was not trained on
     assert "name the scene with -s" in fails("render", "-m", folder)
     trained = {"antialiasing": not mark, "linear_light": True, "white_background": True, "projection": "ellipsoid"}
@@ -221,23 +214,21 @@ def test_open_model(tmp_path, mark, monkeypatch, fails, capsys):
     assert model_folder.open_model(folder, 3)[::2] == (3, trained | {"eval": False})
     monkeypatch.chdir(model_folder.ply_path(folder, 3).parent)
     assert model_folder.open_model("point_cloud.ply")[::2] == (0, trained | {"eval": False})
-    assert main(["convert", str(folder), str(target)]) == 0 and load_gaussians(target).antialiased != mark
-    said = capsys.readouterr().out
+    said = ran("convert", folder, target)
+    assert load_gaussians(target).antialiased != mark
     for lost in ("in the world", "in linear light", "projection (ellipsoid)", "white background"):
         assert lost in said
     for source in (model_folder.ply_path(folder, 20), folder):
-        assert main(["convert", str(source), str(tmp_path / "a.glb")]) == 0
+        ran("convert", source, tmp_path / "a.glb")
         assert load_gaussians(tmp_path / "a.glb").coordinates["origin"] == [1.0, 2.0, 3.0]
     drawn = model_folder.open_model(tmp_path / "a.glb")
     assert load_start(str(folder), print)[0].linear  # so that training can warn
     (folder / "coordinates.json").write_text("{")
     assert model_folder.open_model(folder, 3)[0] == 3 and "coordinates.json" in fails("convert", folder, target)
     model_folder.write_cfg_args(folder, {"projection": "unscented"})
-    assert main(["export-html", str(folder), str(tmp_path / "a.html")]) == 0
-    assert "not by the unscented one" in capsys.readouterr().out
+    assert "not by the unscented one" in ran("export-html", folder, tmp_path / "a.html")
     model_folder.write_cameras(folder, [], [view("1.jpg", 1)])
-    assert main(["export-html", "point_cloud.ply", str(tmp_path / "a.html")]) == 0
-    assert " 1 cameras" in capsys.readouterr().out
+    assert " 1 cameras" in ran("export-html", "point_cloud.ply", tmp_path / "a.html")
     model_folder.write_cfg_args(folder, {"projection": "fisheye"})
     message = fails("render", "-m", folder)
     assert "cfg_args: expected a projection of affine, ellipsoid, unscented, found 'fisheye'" in message

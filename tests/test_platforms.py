@@ -4,6 +4,7 @@ import os
 import platform
 import shutil
 import subprocess
+from functools import partial
 
 import numpy as np
 import pytest
@@ -181,12 +182,8 @@ def test_every_room_can_be_imported():
 @pytest.mark.parametrize(
     ("make", "run", "words"),
     [
-        (write_colmap, lambda root: load_scene(root, report=str), ("COLMAP model", "sparse")),
-        (
-            lambda root: write_transforms(root, k1=0.1),
-            lambda root: load_scene(root, report=str),
-            ("lens OPENCV", "frame 0"),
-        ),
+        (write_colmap, partial(load_scene, report=str), ("COLMAP model", "sparse")),
+        (partial(write_transforms, k1=0.1), partial(load_scene, report=str), ("lens OPENCV", "frame 0")),
         (plain_photos, lambda root: sfm(SfmConfig(str(root), str(root / "scene"))), ("warp-splat sfm",)),
     ],
     ids=["COLMAP", "distortion", "sfm"],

@@ -151,9 +151,17 @@ def in_map(change):
     return lambda folder: change(folder / "depths" / "view_009.png")
 
 
+def another_map(height, width, kind):
+    return in_map(lambda path: write_image(path, np.zeros((height, width, 1), kind)))
+
+
 def in_fits(change):
     """Damage to the parameters of the maps."""
     return lambda folder: change_json(folder, change, PARAMETERS)
+
+
+def scaled(scale):
+    return in_fits(lambda fits: fits.update(view_009={"scale": scale, "offset": 0}))
 
 
 @pytest.mark.parametrize(
@@ -161,13 +169,10 @@ def in_fits(change):
     [
         (in_map(Path.unlink), "view_009.png: expected a map of inverse depth for view_009.png, found none; add it."),
         (
-            in_map(lambda path: write_image(path, np.zeros((100, 264, 1), np.uint16))),
+            another_map(100, 264, np.uint16),
             "expected a map of 264 x 248 pixels as its photograph has, or scaled by one factor, got 264 x 100",
         ),
-        (
-            in_map(lambda path: write_image(path, np.zeros((248, 264, 1), np.uint8))),
-            "view_009.png: expected numbers of 16 bits or floats, found uint8",
-        ),
+        (another_map(248, 264, np.uint8), "view_009.png: expected numbers of 16 bits or floats, found uint8"),
         (
             lambda folder: (folder / PARAMETERS).unlink(),
             "depth_params.json: expected scale and offset of each map of inverse depth, found no such file",
@@ -177,14 +182,8 @@ def in_fits(change):
             "--depths depths: expected maps of 1 / depth, found scales or numbers below 0; fit them.",
         ),
         (in_fits(lambda fits: fits.pop("view_009")), "depth_params.json: expected JSON of the kind"),
-        (
-            in_fits(lambda fits: fits.update(view_009={"scale": None, "offset": 0})),
-            "found {'scale': None, 'offset': 0} for view_009",
-        ),
-        (
-            in_fits(lambda fits: fits.update(view_009={"scale": 10**400, "offset": 0})),
-            "depth_params.json: the file is damaged",
-        ),
+        (scaled(None), "found {'scale': None, 'offset': 0} for view_009"),
+        (scaled(10**400), "depth_params.json: the file is damaged"),
     ],
 )
 def test_what_does_not_fit_is_one_sentence(damage, sentence, mapped):

@@ -164,23 +164,14 @@ def test_inputs_need_not_be_contiguous():
 @pytest.mark.parametrize(
     ("members", "message"),
     [
-        (
-            (3.0,),
-            "Projection.lens: expected a function of the lanes .* of 4 arguments, got 3.0; see docs/extending.md.",
-        ),
-        (
-            (make_lens(16),),
-            "Projection.lens: expected a function of the lanes .* of 4 arguments, got <Function .*; see",
-        ),
-        ((lambda lanes: 3.0,), "Projection.lens: expected .*, got one that makes 3.0; see"),
-        ((make_outline,), "Projection.lens: expected .* of 4 arguments, got one that makes <Function"),
-        (
-            (make_lens, lambda lanes: None),
-            "Projection.outline: expected .* of 17 arguments, got one that makes None; see",
-        ),
+        ((3.0,), "lens: expected a function of the lanes .* of 4 arguments, got 3.0; see docs/extending.md."),
+        ((make_lens(16),), "lens: expected a function of the lanes .* of 4 arguments, got <Function .*; see"),
+        ((lambda lanes: 3.0,), "lens: expected .*, got one that makes 3.0; see"),
+        ((make_outline,), "lens: expected .* of 4 arguments, got one that makes <Function"),
+        ((make_lens, lambda lanes: None), "outline: expected .* of 17 arguments, got one that makes None; see"),
     ],
 )
 def test_what_is_no_projection_is_refused(members, message):
     *geometry, sh_dc, _ = gaussians(1)
-    with pytest.raises(InputError, match=message):
+    with pytest.raises(InputError, match=f"Projection.{message}"):
         rasterize(*geometry, sh_dc, CAMERA, options=RasterOptions(projection=Projection(*members)))
