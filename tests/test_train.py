@@ -24,6 +24,8 @@ from warp_splat.raster.drivers import CPU
 from warp_splat.training.loss import image_loss
 from warp_splat.training.optimizer import Optimizer
 
+FILM = f"-s {SCENE} --video path --frames 2"
+
 
 def learns(folder):
     """Whether PSNR rose before the opacities were reset, and again after."""
@@ -44,7 +46,7 @@ def test_output_folder(trained):
     for name in ("training.png", "profile.png", "preview.png"):
         assert load_png(trained / name).std() > 1
     assert ply_path(trained, 40).is_file() and ply_path(trained, 60).is_file()
-    assert len(load_ply(ply_path(trained, 60)).splats.means) > 4500
+    assert len(load_ply(ply_path(trained, 60)).splats.means) > 4500 and learns(trained)
     entry = json.loads((trained / "results.json").read_text())["ours_60"]
     assert entry["iterations"] == 60 and entry["split"] == "test" and entry["seconds"] > 0
     assert entry["dropped"] == {"pixels": 0, "gradients": 0, "gaussians": 0, "prunings": 0}
@@ -60,32 +62,27 @@ def test_metrics_are_those_of_the_saved_images(trained):
     assert results["PSNR"] == pytest.approx(np.mean(values))
 
 
-def test_training_learns(trained):
-    assert learns(trained)
-
-
-def test_render_repeats_the_pictures_of_training(trained, capsys):
+def test_render_repeats_the_pictures_of_training(trained, ran):
     before = {path.name: path.read_bytes() for path in (trained / "test" / "ours_60" / "renders").iterdir()}
-    assert main(["render", "-m", str(trained), "--quiet"]) == 0
+    ran("render", "-m", trained, "--quiet")
     after = {path.name: path.read_bytes() for path in (trained / "test" / "ours_60" / "renders").iterdir()}
     assert after == before
     assert len(list((trained / "train" / "ours_60" / "gt").iterdir())) == 43
-    assert main(["render", "-m", str(trained), "--iteration", "40", "--skip_train", "--quiet"]) == 0
+    ran("render", "-m", trained, "--iteration", 40, "--skip_train", "--quiet")
     assert json.loads((trained / "results.json").read_text())["ours_60"]["seconds"] > 0  # what training said stays
     assert set(json.loads((trained / "results.json").read_text())) == {"ours_40", "ours_60"}
-    capsys.readouterr()
-    assert main(["render", "-m", str(trained), "--skip_train", "--skip_test", "--quiet"]) == 0
-    assert capsys.readouterr().out == "Nothing to draw: 43 images to train on, 7 held out.\n"
+    said = ran("render", "-m", trained, "--skip_train", "--skip_test", "--quiet")
+    assert said == "Nothing to draw: 43 images to train on, 7 held out.\n"
 
 
 @pytest.mark.slow
-def test_render_of_converted_files(trained, tmp_path, capsys):
+def test_render_of_converted_files(trained, tmp_path, ran):
     """Held-out views of files in other formats against those of the PLY file: a file needs no model folder."""
     pictures = {}
     for ending, decibels in ((".ply", 90), (".glb", 75), (".spz", 45)):
         file = tmp_path / f"a{ending}"
-        assert main(["convert", str(ply_path(trained, 60)), str(file)]) == 0
-        assert main(["render", "-m", str(file), "-s", str(SCENE), "--skip_train", "--quiet"]) == 0
+        ran("convert", ply_path(trained, 60), file)
+        ran("render", "-m", file, "-s", SCENE, "--skip_train", "--quiet")
         folder = tmp_path / f"a{ending}.renders"
         assert json.loads((folder / "results.json").read_text())["ours_0"]["split"] == "test"
         pictures[ending] = [load_png(path) for path in sorted((folder / "test" / "ours_0" / "renders").iterdir())]
@@ -95,10 +92,9 @@ def test_render_of_converted_files(trained, tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_orbit(trained, tmp_path, capsys):
-    options = ["--orbit", "--orbit_center", "focus", "--orbit_output", str(tmp_path / "orbit"), "--quiet"]
-    assert main(["render", "-m", str(trained), *options]) == 0
-    assert "frames per second" in capsys.readouterr().out
+def test_orbit(trained, tmp_path, ran):
+    options = ("--orbit", "--orbit_center", "focus", "--orbit_output", tmp_path / "orbit", "--quiet")
+    assert "frames per second" in ran("render", "-m", trained, *options)
     frames = sorted((tmp_path / "orbit").iterdir())
     first, half = load_png(frames[0]), load_png(frames[50])
     assert len(frames) == 100 and first.shape == (545, 980, 3) and first.std() > 5 and (first != half).mean() > 0.3
@@ -195,16 +191,30 @@ def test_first_step_loads_only_what_it_needs():
     ids=" ".join,
 )
 def test_bad_options(options, words, tmp_path, fails):
-    message = fails("train", "-s", str(SCENE), "-m", str(tmp_path / "model"), *options)
+    message = fails("train", "-s", SCENE, "-m", tmp_path / "model", *options)
     assert all(word in message for word in words)
     assert not (tmp_path / "model").exists()
 
 
-def test_no_flag_is_meant_that_there_is_not(fails):
-    """Arguments have no flags."""
-    assert "--folder: no such flag; warp-splat merge --help" in fails("merge", "a", "--folder", "b")
-    assert "did you mean --keep?" in fails("simplify", "a", "--kep", "0.5")
-    assert "-1: an argument too many" in fails("convert", "a", "b.ply", "-1")
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        ("merge a --folder b", "--folder: no such flag; warp-splat merge --help"),  # arguments have no flags
+        ("simplify a --kep 0.5", "did you mean --keep?"),
+        ("convert a b.ply -1", "-1: an argument too many"),
+        ("render", "-m"),
+        ("render -m folder", "folder"),
+        ("render -m nope", "nope: expected the folder of a trained model"),
+        (f"render -m empty.ply {FILM}", "expected a Gaussian to film"),
+        (f"render -m full.ply {FILM} --video_output full.ply/a.mp4", "full.ply: expected a folder that can be written"),
+    ],
+)
+def test_what_cannot_be(words, sentence, tmp_path, monkeypatch, fails):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "folder").mkdir()
+    for name, count in (("empty.ply", 0), ("full.ply", 5)):
+        save_gaussians(name, some_file(count))
+    assert sentence in fails(*words.split())
 
 
 def test_output_folder_that_cannot_be_written(tmp_path, fails):
@@ -212,22 +222,6 @@ def test_output_folder_that_cannot_be_written(tmp_path, fails):
     for scene in (SCENE, tmp_path / "no scene"):  # said before the scene is loaded
         message = fails("train", "-s", str(scene), "-m", str(tmp_path / "file" / "model"))
         assert f"{tmp_path / 'file'} is no folder" in message
-
-
-def test_render_without_a_model(tmp_path, fails):
-    assert "-m" in fails("render")
-    assert str(tmp_path) in fails("render", "-m", str(tmp_path))
-    assert "nope: expected the folder of a trained model" in fails("render", "-m", str(tmp_path / "nope"))
-
-
-def test_films_that_cannot_be(tmp_path, fails):
-    for name, count in (("empty.ply", 0), ("full.ply", 5)):
-        save_gaussians(tmp_path / name, some_file(count))
-    film = ("-s", str(SCENE), "--video", "path", "--frames", "2")
-    assert "expected a Gaussian to film" in fails("render", "-m", str(tmp_path / "empty.ply"), *film)
-    output = ("--video_output", str(tmp_path / "full.ply" / "a.mp4"))
-    sentence = fails("render", "-m", str(tmp_path / "full.ply"), *film, *output)
-    assert "full.ply: expected a folder that can be written" in sentence
 
 
 def test_a_full_disk_does_not_lose_the_model(tmp_path, monkeypatch, capsys):
