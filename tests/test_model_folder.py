@@ -22,9 +22,16 @@ from warp_splat.formats.splats import SplatFile
 from warp_splat.scene.start import load_start
 from warp_splat.scene.types import Decoded, View
 
-ARGUMENTS = {"sh_degree": 3, "source_path": "a folder/it's", "model_path": Path("output") / "x"}
-ARGUMENTS |= {"white_background": False, "test_iterations": [7000, 30000], "position_lr_init": 1.6e-4}
-ARGUMENTS |= {"offset": -1, "start_checkpoint": None}
+ARGUMENTS = {
+    "sh_degree": 3,
+    "source_path": "a folder/it's",
+    "model_path": Path("output") / "x",
+    "white_background": False,
+    "test_iterations": [7000, 30000],
+    "position_lr_init": 1.6e-4,
+    "offset": -1,
+    "start_checkpoint": None,
+}
 
 
 def test_cfg_args_are_what_argparse_prints_and_come_back(tmp_path):

@@ -24,6 +24,7 @@ from warp_splat.raster.drivers import CPU
 from warp_splat.training.loss import image_loss
 from warp_splat.training.optimizer import Optimizer
 
+
 def learns(folder):
     """Whether PSNR rose before the opacities were reset, and again after."""
     quality = {record["iteration"]: record["psnr"] for record in json.loads((folder / "history.json").read_text())}
