@@ -28,10 +28,15 @@ class Notes:
 
     def __init__(self):
         self.steps: dict[tuple[str, ...], str] = {}  # what is computed of what, and the name of the result
+        self.masks: set[Name] = set()  # names of what is 0 or 1
 
     def note(self, operation: str, *operands: str) -> str:
         """The name of what an operation of :mod:`.simd` gives."""
-        return self.steps.setdefault((operation, *operands), f"v{len(self.steps)}")
+        name = self.steps.setdefault((operation, *operands), f"v{len(self.steps)}")
+        of_masks = operation in ("times", "pick") and {*operands[-2:]} <= self.masks
+        if operation == "less" or of_masks or operands in (("0.0",), ("1.0",)):
+            self.masks.add(name)
+        return name
 
     def constant(self, value: float) -> Name:
         """Its name."""
@@ -62,7 +67,7 @@ class Notes:
 
     def chosen(self, mask: Name, a: Name, b: Name) -> Name:
         """``a`` where the mask is not zero, else ``b``."""
-        if ("less", mask) not in ((step[0], name) for step, name in self.steps.items()):
+        if mask not in self.masks:
             mask = self.product(mask, mask)  # above zero, also of negative numbers
         return self.note("pick", self.real(mask), self.real(a), self.real(b)) if a or b else None
 
