@@ -70,8 +70,9 @@ def synthetic(database, names):
         connection.clear_two_view_geometries()
 
 
-def test_names_with_spaces_are_matched_and_kept(tmp_path):
-    names = [f"a b/photo {index}.jpg" for index in range(8)]
+@pytest.mark.parametrize("name", ["a b/photo {}.jpg", "#{}.jpg"])
+def test_names_with_spaces_and_signs_are_matched_and_kept(tmp_path, name):
+    names = [name.format(index) for index in range(8)]
     synthetic(tmp_path / "database.db", names)
     lines: list[str] = []
     config = SfmConfig("", "", matching="looks", threads=1, quiet=True)

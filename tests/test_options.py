@@ -90,6 +90,7 @@ def test_what_cannot_be_is_refused(arguments, message, fails):
         ("iterations = true", "iterations: expected a whole number, found True"),
         ("eval = 1", "eval: expected true or false, found 1"),
         ("source_path = 1979-05-27", "source_path: expected a text"),
+        ('source_path = "a\\u0000b"', "source_path: expected a text"),
         ("save_iterations = [1.5]", "save_iterations: expected a list of numbers"),
         ('preset = "slow"', "preset: expected one of '', 'fast', found 'slow'"),
         ("[train]\niterations = 3", "train: no such option"),
@@ -102,6 +103,11 @@ def test_files_that_are_wrong(tmp_path, fails, text, sentence):
     file = tmp_path / "a.toml"
     file.write_text(text, errors="surrogateescape")
     assert fails("train", "--config", file).startswith(f"warp-splat: error: --config {file}: {sentence}")
+
+
+def test_a_file_may_begin_with_the_mark_of_its_order_of_bytes(tmp_path):
+    (tmp_path / "a.toml").write_text("iterations = 3", encoding="utf-8-sig")
+    assert read_config(tmp_path / "a.toml") == {"iterations": 3}
 
 
 def test_no_file():

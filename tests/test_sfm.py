@@ -170,7 +170,7 @@ def test_ctrl_c_inside_pycolmap_stays_one(scene, tmp_path):
     database = shutil.copy(scene / "sfm" / "database.db", tmp_path)
     with pytest.raises(TypeError):
         pycolmap.Database.open(Interrupted(database))
-    stages.rename(Interrupted(database), "photo", "picture")
+    stages.rename(Interrupted(database), stages.HIDING)
     assert matching.fitting(Interrupted(database)) == matching.fitting(database)
 
 
@@ -284,6 +284,11 @@ def test_photographs_of_one_size_that_were_exchanged_are_others(tmp_path):
     refusal(lambda: _claim(tmp_path / "a", tmp_path / "b", config), "begun with others")
     (work / "marks.json").unlink()
     assert _claim(tmp_path / "a", tmp_path / "b", config) == work
+    for missing in (["input.json"], ["input.json", "marks.json"]):  # of a run that was killed while it began
+        for name in missing:
+            (work / name).unlink()
+        (work / ".tmp-1.json").touch()
+        assert _claim(tmp_path / "a", tmp_path / "b", config) == work and (work / "marks.json").is_file()
 
 
 def test_a_damaged_database_gets_one_sentence(photos, scene, tmp_path):

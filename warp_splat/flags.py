@@ -78,7 +78,8 @@ def _is_like(value: Any, default: Any) -> bool:
         return type(value) is list and all(_is_like(item, 0) for item in value)
     if type(default) is float:
         return type(value) is float or _is_like(value, 0)
-    return type(value) is type(default) and (type(value) is not int or abs(value) < 2**63)
+    fits_in = "\0" not in value if type(value) is str else type(value) is not int or abs(value) < 2**63
+    return type(value) is type(default) and fits_in
 
 
 #: Flags of the reference that this program does not have, and what to say when somebody uses one.

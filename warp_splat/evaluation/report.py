@@ -10,6 +10,7 @@ import itertools
 import os
 import platform
 import re
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -177,6 +178,7 @@ def new_figure(width: float, height: float, layout: Literal["constrained", "comp
     """An empty figure in inches that belongs to no pyplot state and needs no display."""
     from matplotlib.figure import Figure  # noqa: PLC0415 - half a second, only for pictures
 
+    warnings.filterwarnings("ignore", "Glyph", UserWarning)  # of letters in names that the font has not
     return Figure(figsize=(width, height), dpi=DPI, layout=layout, facecolor="white")
 
 

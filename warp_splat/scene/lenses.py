@@ -70,7 +70,7 @@ def make_photo(
             raise InputError(
                 "expected a camera model that can be undistorted to a pinhole, with finite parameters, got "
                 f"{lens.model} {list(lens.params)}; correct the model, leave this image out, or keep its lens "
-                "(--lens native)."
+                "(train with --lens native)."
             )
         if loaded.is_undistorted() and "FISHEYE" not in lens.model:  # of those it means: no more than its angles
             return Photo(name, path, _pinhole(loaded, pose).resized(*size))

@@ -141,11 +141,11 @@ def _claim(source: Path, scene: Path, config: SfmConfig) -> Path:
                 f"{scene}: expected a folder begun with the same photographs and options, but this one was begun with "
                 "others; choose another folder, or remove this one."
             )
-    elif scene.exists() and (not scene.is_dir() or any(scene.iterdir())):
+    elif scene.exists() and (not scene.is_dir() or any(p not in (work, work / MARKS) for p in scene.rglob("[!.]*"))):
         raise InputError(f"{scene}: expected a new or empty folder, found one that is in use; choose another.")
     else:
-        write_text(work / "input.json", record)
         write_text(work / MARKS, marks)
+        write_text(work / "input.json", record)
     return work
 
 

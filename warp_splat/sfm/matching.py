@@ -17,7 +17,7 @@ from warp_splat.config import SfmConfig
 from warp_splat.formats.files import write_text
 from warp_splat.scene.colmap_library import pycolmap
 from warp_splat.sfm import looks
-from warp_splat.sfm.stages import BAR, SPACE, rename, run_watched
+from warp_splat.sfm.stages import BAR, HIDING, SHOWING, rename, run_watched
 
 FAISS_THRESHOLD = "_ZN5faiss31distance_compute_blas_thresholdE"  # queries from which on it calls BLAS
 # Pairs are matched in blocks of BLOCK x BLOCK, and Ctrl-C is heard in between. Tried:
@@ -125,11 +125,11 @@ def _match_by_looks(database: Path, config: SfmConfig, say: Callable[[str], obje
 def match_pairs(database: Path, pairs: list[tuple[str, str]], total: int, config: SfmConfig) -> None:
     """Match the ``pairs`` of names; ``total`` are to be there then, for the bar."""
     listed = database.with_name("pairs.txt")
-    write_text(listed, "".join(" ".join(name.replace(" ", SPACE) for name in pair) + "\n" for pair in pairs))
+    write_text(listed, "".join(" ".join(name.translate(HIDING) for name in pair) + "\n" for pair in pairs))
     pairing = pycolmap.ImportedPairingOptions(block_size=BLOCK * BLOCK, match_list_path=listed)
-    rename(database, " ", SPACE)
+    rename(database, HIDING)
     try:
         _run(database, pycolmap.match_image_pairs, pairing, total, config)
     finally:
-        rename(database, SPACE, " ")
+        rename(database, SHOWING)
     listed.unlink()

@@ -27,7 +27,9 @@ from warp_splat.scene.colmap_library import pycolmap
 LENS = "OPENCV"  # fx, fy, cx, cy, two radial and two tangential coefficients: what phones and cameras need
 POLL = 0.3  # seconds
 ROOM = 2**26  # bytes of a disk: where it has none left, pycolmap ends the process
-SPACE = "\x1f"  # stands for a space in names while a list of pairs is matched: pycolmap splits its lines at spaces
+# What stands for spaces and number signs in names while a list of pairs is matched: pycolmap splits its lines at the
+# former, and leaves out those that begin with the latter. And back.
+HIDING, SHOWING = str.maketrans(" #", "\x1f\x1e"), str.maketrans("\x1f\x1e", " #")
 BAR = "{desc:12s} {percentage:3.0f}% |{bar}| {n_fmt}/{total_fmt} [{elapsed}<{remaining}]"
 
 
@@ -72,19 +74,19 @@ def check_room(folder: Path, full: bool = False) -> None:
         )
 
 
-def rename(database: Path, old: str, new: str) -> None:
-    """Write ``new`` for ``old`` in the names of images."""
+def rename(database: Path, letters: dict[int, int]) -> None:
+    """Change letters in the names of images."""
     # a string, here and elsewhere: of a Path, pycolmap runs Python, and a Ctrl-C that comes there becomes a TypeError
     with pycolmap.Database.open(str(database)) as connection:
         for image in connection.read_all_images():
-            if old in image.name:
-                image.name = image.name.replace(old, new)
+            if (name := image.name.translate(letters)) != image.name:
+                image.name = name
                 connection.update_image(image)
 
 
 def extract(database: Path, root: Path, groups: list[list[str]], config: SfmConfig, stops: bool = True) -> None:
     """Find SIFT features in the photographs below ``root``; those of a group share a lens. ``stops``: run_watched's."""
-    rename(database, SPACE, " ")  # of a run that was killed while it matched
+    rename(database, SHOWING)  # of a run that was killed while it matched
     for names in groups:  # first, so that images are numbered by name and not by which thread was faster
         reader = pycolmap.ImageReaderOptions()
         reader.camera_model = LENS

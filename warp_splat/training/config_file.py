@@ -26,7 +26,7 @@ def read_config(path: str | Path) -> dict[str, Any]:
     """
     problem = f"--config {path}: expected a TOML file with options of training"
     with refusing((OSError, ValueError, RecursionError), problem), open(path, "rb") as file:
-        found = tomllib.load(file)
+        found = tomllib.loads(file.read().decode("utf-8-sig"))
     options = {item.name: item for item in flags_of(TrainConfig) if item.name != "config"}
     for name, value in found.items():
         if name not in options:
