@@ -366,6 +366,7 @@ def test_a_full_disk_loses_no_surface(model, scene, tmp_path, monkeypatch, full)
     [
         (["link.ply"], "link.ply: expected another file than the model"),
         (["ball.stl"], "expected a name that ends in .ply, .glb, .obj"),
+        (["/"], "expected a name that ends in .ply, .glb, .obj"),
         (["file/ball.ply"], "expected a folder that can be written"),
         (["ball.ply", "--collision", "9999999999999999999"], "--collision: expected 0 to 1000000"),
         (["ball.ply", "--collision", "2"], "ball_collision.ply: expected the name of a file to write, found a folder"),

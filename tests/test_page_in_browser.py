@@ -247,7 +247,7 @@ def test_what_cannot_be_exported_is_refused_and_an_older_page_stays(tmp_path, fa
     target = tmp_path / "page.html"
     target.write_text("older")
     for arguments, sentence in (
-        ([folder, tmp_path / "page.ply"], "page.ply: expected the name of a page"),
+        ([folder, tmp_path / "page.ply"], "page.ply: expected a name that ends in .html"),
         ([tmp_path / "none.ply", target], "none.ply: no such file"),
         ([tmp_path, target], "is it a model folder"),
         ([folder, target, "--max_gaussians", "-1"], "--max_gaussians: expected at least 0"),

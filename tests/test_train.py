@@ -201,10 +201,13 @@ def test_bad_options(options, words, tmp_path, fails):
         ("simplify a --kep 0.5", "did you mean --keep?"),
         ("convert a b.ply -1", "-1: an argument too many"),
         ("render", "-m"),
-        ("render -m folder", "folder"),
+        ("render -m folder", "folder: "),
         ("render -m nope", "nope: expected the folder of a trained model"),
         ("render -m empty.ply --video path", "expected a Gaussian to film"),
-        ("render -m full.ply --video path --video_output full.ply/a.mp4", "expected a folder that can be written"),
+        (
+            "render -m full.ply --video path --video_output full.ply/a.mp4",
+            "full.ply: expected a folder that can be written",
+        ),
     ],
 )
 def test_what_cannot_be(words, sentence, tmp_path, monkeypatch, fails):

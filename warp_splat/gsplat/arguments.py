@@ -60,7 +60,7 @@ def check_request(request: Request) -> Request:
         raise InputError(f"means: expected a scene or more, got {list(means.shape)}.")
     if request.covars is not None:  # then these are ignored
         given = given | {"quats": means.new_ones(*batch, count, 4), "scales": means.new_ones(*batch, count, 3)}
-    _check_tensor("colors", colors, getattr(colors, "shape", ()), means.device)
+    _check_tensor("colors", colors, getattr(colors, "shape", ("...", "N", "D")), means.device)
     per_view = _check_colors(request, batch, count, cameras)
     shapes: dict[str, tuple[int, ...]] = {
         "means": (count, 3),

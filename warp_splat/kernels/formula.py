@@ -68,7 +68,8 @@ class Notes:
     def chosen(self, mask: Name, a: Name, b: Name) -> Name:
         """``a`` where the mask is not zero, else ``b``."""
         if mask not in self.masks:
-            mask = self.product(mask, mask)  # above zero, also of negative numbers
+            zero, number = self.real(None), self.real(mask)
+            mask = self.note("plus", self.note("less", zero, number), self.note("less", number, zero))
         return self.note("pick", self.real(mask), self.real(a), self.real(b)) if a or b else None
 
     def real(self, a: Name) -> str:

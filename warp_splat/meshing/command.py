@@ -45,7 +45,7 @@ def mesh(config: MeshConfig) -> int:
         InputError: if the model, its scene, an option or a needed package is not usable; if there is no surface.
     """
     output = Path(config.output)
-    pieces_place = output.with_name(f"{output.stem}_collision{output.suffix}")
+    pieces_place = output.parent / f"{output.stem}_collision{output.suffix}"
     for place in (output, pieces_place) if config.collision else (output,):
         check_output(place, config.model, config.iteration, ENDINGS)
     if config.triangles and config.watertight:

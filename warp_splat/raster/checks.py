@@ -67,7 +67,7 @@ def is_one_of(value: object, choices: Collection) -> bool:
 def check_choice(name: str, value: object, choices: Collection) -> None:
     """Raise InputError if ``value`` is none of ``choices``."""
     if not is_one_of(value, choices):
-        raise InputError(f"{name}: expected one of {', '.join(map(str, choices))}, got {value!r}.")
+        raise InputError(f"{name}: expected one of {', '.join(map(str, choices))}, got {value!r:.80}.")
 
 
 def check_options(adjoint: str, options: RasterOptions | None) -> RasterOptions:
