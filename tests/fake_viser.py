@@ -53,9 +53,15 @@ class FakeClient:
 
     def __init__(self, number, camera, size=(96, 64)):
         self.client_id, self.frames = number, []
-        place = {"wxyz": wxyz(camera), "position": camera.center, "look_at": camera.center + 4 * camera.forward}
-        window = {"fov": 1.0, "image_width": size[0], "image_height": size[1]}
-        self.camera = SimpleNamespace(**place, **window, on_update=lambda handler: setattr(self, "moved", handler))
+        self.camera = SimpleNamespace(
+            wxyz=wxyz(camera),
+            position=camera.center,
+            fov=1.0,
+            image_width=size[0],
+            image_height=size[1],
+            look_at=camera.center + 4 * camera.forward,
+            on_update=lambda handler: setattr(self, "moved", handler),
+        )
         self.gui = SimpleNamespace(
             add_dropdown=lambda label, options, **_: Control(options[0]),
             add_slider=lambda label, low, high, step, value, **_: Control(value),

@@ -173,7 +173,7 @@ def test_harmonics_that_do_not_show_become_zeros():
 
 def test_a_view_that_is_drawn_exactly_hides_no_other():
     views = [SimpleNamespace(camera=0, name=name, picture=np.zeros((4, 4, 3), np.uint8), mask=None) for name in "ab"]
-    model = SimpleNamespace(picture_of=lambda _: lambda camera, name: np.full((4, 4, 3), 10 * (name == "b"), np.uint8))
+    model = SimpleNamespace(picture_of=lambda *_: lambda camera, name: np.full((4, 4, 3), 10 * (name == "b"), np.uint8))
     assert Opened.psnr(model, None, views) == pytest.approx((99 + 20 * np.log10(25.5)) / 2)
 
 
