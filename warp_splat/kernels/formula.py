@@ -123,6 +123,9 @@ class Number(np.lib.mixins.NDArrayOperatorsMixin):
     def __bool__(self) -> bool:
         raise InputError("lens formula: expected choices by np.where, found one by if, and, or, not, min or max.")
 
+    def __float__(self) -> float:
+        raise InputError("lens formula: expected functions of NumPy, found float or one of Python's math.")
+
 
 def _aligned(notes: Notes, operands: Sequence) -> list[Number]:
     """All as numbers with as many slopes."""

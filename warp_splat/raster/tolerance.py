@@ -44,7 +44,7 @@ def paint_within(
     Raises:
         InputError: if the tolerance is an array of another size than the image.
     """
-    allowed = torch.as_tensor(options.tolerance, dtype=torch.float32)
+    allowed = torch.as_tensor(options.tolerance, dtype=torch.float32).detach()
     if allowed.dim() and allowed.shape != (camera.height, camera.width):
         wanted, given = f"[{camera.height}, {camera.width}]", list(allowed.shape)
         raise InputError(f"options.tolerance: expected a number, or one for each pixel {wanted}, got {given}.")
