@@ -174,6 +174,17 @@ def test_ctrl_c_inside_pycolmap_stays_one(scene, tmp_path):
     assert matching.fitting(Interrupted(database)) == matching.fitting(database)
 
 
+def test_ctrl_c_while_pycolmap_loads_stays_one(tmp_path):
+    """There it becomes an ImportError of C++, of which pycolmap makes its own advice."""
+    (tmp_path / "pycolmap.py").write_text(
+        "import os, signal\n"
+        "try:\n    os.kill(os.getpid(), signal.SIGINT)\n"
+        "except KeyboardInterrupt as error:\n    raise RuntimeError('install it') from error\n"
+    )
+    program = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); import warp_splat.scene.colmap_library"
+    assert python("-c", program, check=False).stderr.strip().endswith("KeyboardInterrupt")
+
+
 def test_ctrl_c_ends_a_trial_at_once_and_leaves_nothing(tmp_path):
     (tmp_path / "trial").mkdir()
     done = python("-c", TRIAL.format(str(tmp_path / "trial")), check=False)

@@ -1,18 +1,17 @@
 """pycolmap where it is installed, else None: it has no wheel for Linux on ARM."""
 
-import signal
-import threading
-
-try:
-    import pycolmap
-
-    if threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM))  # its own would print a stack of C++
-except ImportError:
-    pycolmap = None  # type: ignore
-import OpenImageIO  # noqa: F401 - after pycolmap, whose libraries clash with its own, writing a PNG would crash
-
 from warp_splat.errors import InputError
+from warp_splat.runtime.interrupts import interruptible
+
+# Ctrl-C while it loads would become its RuntimeError. Of SIGTERM it takes care itself, and prints a stack of C++.
+with interruptible() as interrupted:
+    try:
+        import pycolmap
+    except ImportError:
+        pycolmap = None  # type: ignore
+if interrupted:
+    raise KeyboardInterrupt
+import OpenImageIO  # noqa: F401 - after pycolmap, whose libraries clash with its own, writing a PNG would crash
 
 
 def require_pycolmap(what: str) -> None:
