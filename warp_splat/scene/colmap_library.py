@@ -1,5 +1,7 @@
 """pycolmap where it is installed, else None: it has no wheel for Linux on ARM."""
 
+import signal
+
 from warp_splat.errors import InputError
 from warp_splat.runtime.interrupts import interruptible
 
@@ -9,9 +11,9 @@ with interruptible() as interrupted:
         import pycolmap
     except ImportError:
         pycolmap = None  # type: ignore
-if interrupted:
-    raise KeyboardInterrupt
-import OpenImageIO  # noqa: F401 - after pycolmap, whose libraries clash with its own, writing a PNG would crash
+for number in interrupted:  # for the handler of whoever loads this
+    signal.raise_signal(number)
+import OpenImageIO  # noqa: E402, F401 - after pycolmap, whose libraries clash with its own, writing a PNG would crash
 
 
 def require_pycolmap(what: str) -> None:
