@@ -9,10 +9,11 @@ import pytest
 import torch
 from made_up import make_trainer
 
-from warp_splat import Camera, rasterize
+from warp_splat import Camera, RasterOptions, rasterize
 from warp_splat.gaussians import GaussianModel
 from warp_splat.kernels.project.quarantine import quarantine
 from warp_splat.raster import bin, project
+from warp_splat.raster.data import Dropped, Gaussians
 from warp_splat.runtime import launch, pool
 from warp_splat.runtime.distributed import ALONE
 from warp_splat.training.growth.reference import Reference
@@ -159,14 +160,20 @@ def test_calls_at_once_share_their_own_work(threads):
     assert sorted(done) == [*range(15)]
 
 
-@pytest.mark.parametrize(
-    ("rows", "value", "finite"), [([], 0.0, True), ([COUNT - 1], torch.nan, False), ([0, -1], torch.inf, False)]
-)
-def test_sums_find_what_is_not_finite(threads, rows, value, finite):
-    tensors = [torch.ones(COUNT, 3), torch.ones(COUNT)]
+@pytest.mark.parametrize(("rows", "value"), [([], 0.0), ([COUNT - 1], torch.nan), ([0, COUNT - 1], torch.inf)])
+def test_gradients_that_are_not_finite_are_found_in_every_slice(threads, model, rows, value):
+    given = Gaussians(*(tensor.detach().requires_grad_() for tensor in model.activated()))
+    given.sh_rest.data.zero_()
+    given.sh_dc.data.fill_(1.0)  # no color is clamped
+    camera = Camera(64, 48, 60.0, 60.0, 32.0, 24.0, np.eye(3), np.array([0.0, 0.0, 9.0]))
+    seen, dropped = project.project(given, camera, RasterOptions(), dropped=(found := Dropped())), [False] * COUNT
+    upstream = torch.ones_like(seen.colors)
     for row, sign in zip(rows, (1.0, -1.0), strict=False):
-        tensors[0][row] = sign * value
-    assert project._all_finite(tensors) == finite
+        assert seen.radii[row] > 0
+        upstream[row], dropped[row] = sign * value, True
+    seen.colors.backward(upstream)
+    assert found.gaussians == len(rows) and torch.isfinite(given.sh_dc.grad).all()
+    assert not given.sh_dc.grad[dropped].any() and given.sh_dc.grad[(seen.radii > 0) & ~torch.tensor(dropped)].all()
 
 
 def test_a_sum_that_overflows_drops_nothing():

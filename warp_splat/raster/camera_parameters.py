@@ -162,9 +162,9 @@ def intrinsics_gradient(camera: Camera, time: np.ndarray, sums: np.ndarray) -> n
     return sums / [camera.fx, camera.fy, 1.0, 1.0] + np.array([0.0, time[0], 0.0, time[1]]) / camera.height
 
 
-def coefficients_gradient(lens: Lens, found: list[torch.Tensor], coefficients: torch.Tensor) -> torch.Tensor:
+def coefficients_gradient(lens: Lens, found: torch.Tensor, coefficients: torch.Tensor) -> torch.Tensor:
     """Of a lens's coefficients, like them; ``found``: of each group, of the formula's."""
-    total = in_pairs(torch.cat(found)).cpu().numpy()
+    total = in_pairs(found).cpu().numpy()
     return torch.tensor((total[:, None] * _prepared(lens)).sum(0)).to(coefficients)
 
 
@@ -214,11 +214,11 @@ def with_motion(quats: torch.Tensor, motion: np.ndarray | float, lanes: int) -> 
     return groups.view(-1, 3, 4 * lanes)
 
 
-def motion_gradient(turns: list[torch.Tensor], lanes: int, wanted: bool) -> np.ndarray:
+def motion_gradient(turns: torch.Tensor | None, lanes: int, wanted: bool) -> np.ndarray:
     """Of the motion [2, 4], from that of what :func:`with_motion` made, in one order everywhere; zeros without one."""
-    if not (turns and wanted):
+    if turns is None or not wanted:
         return np.zeros((2, 4))
-    parts = torch.cat(turns).view(-1, 3, lanes, 4)[:, 1:].nan_to_num(0.0, 0.0, 0.0)
+    parts = turns.view(-1, 3, lanes, 4)[:, 1:].nan_to_num(0.0, 0.0, 0.0)
     while parts.shape[2] > 1:
         parts = torch.add(*parts.chunk(2, 2))
     return in_pairs(parts.reshape(-1, 8)).cpu().numpy().reshape(2, 4)

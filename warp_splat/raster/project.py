@@ -2,7 +2,7 @@
 
 import importlib
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -28,11 +28,12 @@ from warp_splat.raster import camera_parameters as cameras
 from warp_splat.raster.camera_parameters import CameraParameters
 from warp_splat.raster.data import Dropped, Gaussians, Splats2D, falloff_of, plus
 from warp_splat.raster.drivers import Driver, driver_of
-from warp_splat.runtime.launch import arrays_of, filled_up, launch, pack_struct, view
-from warp_splat.runtime.pool import even_slices, in_slices, set_zero, torch_slices
+from warp_splat.runtime.launch import arrays_of, bind, filled_up, launch, pack_struct, view
+from warp_splat.runtime.pool import even_slices, in_slices
 from warp_splat.runtime.timers import stage
 
 Tensors = Sequence[torch.Tensor]
+Pass = Callable[[int, int], object]  # over groups of Gaussians
 
 
 def camera_view(camera: Camera, rest: int, options: RasterOptions, limits: Camera) -> CameraView:
@@ -118,12 +119,12 @@ def project(
     return Splats2D(*Project.apply(*gaussians, *learned, it))
 
 
-def _launch_geometry(
+def _geometry_of(
     it: Projecting, inputs: Tensors, outputs: Tensors, adj_inputs: Tensors = (), adj_outputs: Tensors = ()
-) -> list[torch.Tensor]:
+) -> tuple[Pass, torch.Tensor | None]:
     """The geometry of N Gaussians; or, with adjoints, the adjoint of that, added to ``adj_inputs``.
 
-    In groups of lanes: the last ones are filled up with zeros, which are no Gaussians.
+    In groups of lanes: the last one is filled up with zeros, which are no Gaussians.
 
     Args:
         it: what to launch.
@@ -133,40 +134,49 @@ def _launch_geometry(
         adj_outputs: of all outputs; those of the last two are not read.
 
     Returns:
-        The gradients, of each group, of what all Gaussians share: of a shutter's motion with the quaternions
-        (:func:`.camera_parameters.motion_gradient`), or of the formula's coefficients [N / lanes, K]; else nothing.
+        A pass over groups; and where it adds the gradients of each of what all Gaussians share: of a shutter's motion
+        with the quaternions (:func:`.camera_parameters.motion_gradient`), or of the formula's coefficients
+        [N / lanes, K]; else nothing.
     """
-    lanes, count, motion, shared_grads = it.driver.lanes, len(outputs[-1]), cameras.motion_of(it.camera), []
+    lanes, count, motion, bend = it.driver.lanes, len(outputs[-1]), cameras.motion_of(it.camera), adj_inputs and it.bend
     number, integer, row2, row3, row4 = TYPES[lanes]
     types_in, types_out = (row3, row4, row3, number), (row2, row3, number, number, row2, integer)
-    whole = count - count % lanes
-    for part in [slice(0, whole)] + [slice(whole, count)] * (whole < count):
-        rows, kernel = -(-(part.stop - part.start) // lanes) * lanes, it.kernel
-        given, made, adj_given, adj_made = (
-            [filled_up(tensor if whole == count else tensor[part], rows) for tensor in table]
-            for table in (inputs, outputs, adj_inputs, adj_outputs)
-        )
+    tables, whole, shared = (inputs, outputs, adj_inputs, adj_outputs), count // lanes, None
+    if bend or (adj_inputs and motion is not None):
+        shared = inputs[0].new_zeros(-(-count // lanes), *((len(it.camera.lens.numbers),) if bend else (3, 4 * lanes)))
+
+    def bound(given: Tensors, made: Tensors, adj_given: Tensors, adj_made: Tensors, groups: slice) -> Pass:
         arrays, adj_arrays = [it.cam, *arrays_of(types_in, given)], [it.cam, *arrays_of(types_in, adj_given)]
-        if it.bend and adj_inputs:
-            kernel, numbers = it.bend, given[0].new_tensor(it.camera.lens.numbers).repeat(rows // lanes, 1)
-            shared_grads.append(torch.zeros_like(numbers))
-            arrays.insert(0, view(numbers, wp.float32))
-            adj_arrays.insert(0, view(shared_grads[-1], wp.float32))
+        grads = None if shared is None else shared[groups]
+        if bend:
+            arrays.insert(0, view(grads.new_tensor(it.camera.lens.numbers).repeat(len(grads), 1), wp.float32))
+            adj_arrays.insert(0, view(grads, wp.float32))
         elif motion is not None:
-            moved = cameras.with_motion(given[1], motion, lanes)
-            arrays[2] = view(moved, row4)
-            if adj_inputs:
-                shared_grads.append(cameras.with_motion(adj_given[1], 0.0, lanes))
-                adj_arrays[2] = view(shared_grads[-1], row4)
+            arrays[2] = view(cameras.with_motion(given[1], motion, lanes), row4)
+            adj_arrays[2:3] = [] if grads is None else [view(grads, row4)]
         adj_out = [*arrays_of(types_out, adj_made[:4]), None, None]
         adjoint = {"adj_inputs": adj_arrays, "adj_outputs": adj_out} if adj_inputs else {}
-        _launch_groups(kernel, lanes, rows, arrays, arrays_of(types_out, made), given[0].device, **adjoint)
-        if motion is not None and adj_inputs:
-            adj_given[1].copy_(shared_grads[-1][:, 0].reshape_as(adj_given[1]))
-        if rows > part.stop - part.start:
-            for tensor, group in zip(adj_inputs or outputs, adj_given or made, strict=True):
-                tensor[part] = group[: count - whole]
-    return shared_grads
+        kernel = bind(bend or it.kernel, arrays, arrays_of(types_out, made), made[-1].device, **adjoint)
+
+        def run(low: int, high: int) -> None:
+            kernel(low, high)
+            if grads is not None and not bend:
+                quats = adj_given[1][lanes * low : lanes * high]
+                quats.copy_(grads[low:high, 0].reshape_as(quats))
+
+        return run
+
+    def run(low: int, high: int) -> None:
+        if low < whole:
+            most(low, min(high, whole))
+        if high > whole:
+            ends = [[filled_up(tensor[lanes * whole :], lanes) for tensor in table] for table in tables]
+            bound(*ends, slice(whole, None))(0, 1)
+            for tensor, group in zip(adj_inputs or outputs, ends[2] or ends[1], strict=True):
+                tensor[lanes * whole :] = group[: count - lanes * whole]
+
+    most = bound(*([tensor[: lanes * whole] for tensor in table] for table in tables), slice(0, whole))
+    return run, shared
 
 
 def _harmonics(sh_dc: torch.Tensor, sh_rest: torch.Tensor) -> HarmonicsView:
@@ -178,10 +188,15 @@ def _harmonics(sh_dc: torch.Tensor, sh_rest: torch.Tensor) -> HarmonicsView:
     return pack_struct(HarmonicsView, **dict(zip(HarmonicsView.vars, (sh_dc[:, 0], *degrees), strict=True)))
 
 
-def _launch_groups(kernel: wp.Kernel, lanes: int, count: int, inputs, outputs, device, **adjoint) -> None:
-    """Launch a kernel for groups of ``lanes`` on ``count`` Gaussians."""
+def _in_turn(passes: Sequence[Pass], count: int, lanes: int, device: torch.device) -> None:
+    """Go through the groups of ``count`` Gaussians by one pass after the other, slice by slice."""
+
+    def run(low: int, high: int) -> None:
+        for each in passes:
+            each(low, high)
+
     groups = -(-count // lanes)
-    launch(kernel, groups, inputs, outputs, bounds=even_slices(groups, each=lanes), device=device, **adjoint)
+    in_slices(run, [0, groups] if device.type == "cuda" else even_slices(groups, each=lanes))
 
 
 class Project(torch.autograd.Function):
@@ -194,12 +209,13 @@ class Project(torch.autograd.Function):
         count, new, lanes = means.shape[0], means.new_empty, it.driver.lanes
         splats = Splats2D(
             *(new(count, 2), new(count, 3), new(count), new(count, 3), new(count), new(count, 2)),
-            radii=means.new_full((count,), int(UNSEEN), dtype=torch.int32),
+            radii=new(count, dtype=torch.int32),
         )
-        set_zero(*splats[:-1])
-        _launch_geometry(it, gaussians[:4], _geometry(splats))
+        geometry, _ = _geometry_of(it, gaussians[:4], _geometry(splats))
         given = [it.cam, view(gaussians.means, wp.vec3), _harmonics(gaussians.sh_dc, gaussians.sh_rest)]
-        _launch_groups(make_shade(lanes), lanes, count, given, [splats.view()], means.device)
+        shade = bind(make_shade(lanes), given, [splats.view()], means.device)
+        unseen: Pass = lambda low, high: splats.radii[lanes * low : lanes * high].fill_(int(UNSEEN))  # noqa: E731
+        _in_turn([_clear(splats[:-1], lanes), unseen, geometry, shade], count, lanes, means.device)
         ctx.save_for_backward(*gaussians, *splats, *learned)
         ctx.it = it
         ctx.mark_non_differentiable(splats.extents, splats.radii)
@@ -228,21 +244,29 @@ class Project(torch.autograd.Function):
             means, colors, adj_colors = (view(tensor, wp.vec3) for tensor in tensors)
             inputs = [it.cam, means, _harmonics(given.sh_dc, rest), seen, colors, adj_colors]
             outputs = [view(adj_means, wp.vec3), _harmonics(adj_dc, adj_rest)]
-            _launch_groups(make_adj_shade(lanes), lanes, count, inputs, outputs, device)
+            shade = bind(make_adj_shade(lanes), inputs, outputs, device)
             if lanes == 1 and rest.shape[1] > 0:
                 numbers = [it.cam, means, seen, colors, adj_colors], [view(adj_rest, wp.vec3)]
                 launch(make_adj_rest(), adj_rest[..., 0].numel(), *numbers, device=device)
             shapes = [torch.empty_like(tensor) for tensor in (given.quats, given.scales, given.opacities)]
-            set_zero(*shapes)
             adj = Gaussians(adj_means, *shapes, adj_dc, adj_rest)
             adj_placed = torch.zeros_like(adj_means) if wants_pose else adj_means  # else added to the colors' part
             outputs, adj_outputs = _geometry(splats), _geometry(adj_splats)
-            found = _launch_geometry(it, given[:4], outputs, [adj_placed, *shapes], adj_outputs)
+            geometry, shared = _geometry_of(it, given[:4], outputs, [adj_placed, *shapes], adj_outputs)
+            sums: list[float] = []
+
+            def total(low: int, high: int) -> None:
+                rows = slice(lanes * low, lanes * high)
+                if wants_pose:
+                    adj_means[rows] += adj_placed[rows]
+                if it.driver.peeks:
+                    sums.extend(float(tensor[rows].sum()) for tensor in adj[:5])
+
+            _in_turn([shade, _clear(shapes, lanes), geometry, total], count, lanes, device)
             adj_twist = adj_intrinsics = adj_last = adj_coefficients = None
             peeks = it.driver.peeks or it.camera.shutter is not None  # whose motion the host has looked at
-            adj_motion = cameras.motion_gradient([] if it.bend else found, lanes, wants_pose or wants_intrinsics)
+            adj_motion = cameras.motion_gradient(None if it.bend else shared, lanes, wants_pose or wants_intrinsics)
             if wants_pose:
-                adj_means += adj_placed
                 inputs = [it.cam, given.means, given.quats, adj_means, adj_placed, adj.quats]
                 sums = cameras.sums_of(make_adj_pose, lanes, 6, inputs)
                 by_twist = partial(cameras.twist_gradient, it.camera, it.here, adj_motion)
@@ -254,9 +278,9 @@ class Project(torch.autograd.Function):
                 by_intrinsics = partial(cameras.intrinsics_gradient, it.camera, adj_motion[:, 3])
                 adj_intrinsics = cameras.of_sums(by_intrinsics, sums, peeks, intrinsics)
             if it.bend:
-                adj_coefficients = cameras.coefficients_gradient(it.camera.lens, found, coefficients)
+                adj_coefficients = cameras.coefficients_gradient(it.camera.lens, shared, coefficients)
             # a GPU would have to stop for the answer; sh_rest's are multiples of those of sh_dc
-            if not (it.driver.peeks and _all_finite(adj[:5])):
+            if not (it.driver.peeks and math.isfinite(sum(sums))):
                 bad = torch.zeros_like(splats.radii)
                 types = (wp.vec3, wp.vec4, wp.vec3, wp.float32, wp.vec3, wp.vec3, wp.int32)
                 outputs = [view(tensor, dtype) for tensor, dtype in zip((*adj, bad), types, strict=True)]
@@ -272,12 +296,7 @@ def _geometry(splats: Splats2D) -> list[torch.Tensor]:
     return [splats.means2d, splats.conics, splats.opacities, splats.depths, splats.extents, splats.radii]
 
 
-def _all_finite(tensors: Tensors) -> bool:
-    """Whether the sums of ``tensors``, N rows each, are finite: then all is."""
-    sums: list[float] = []
-
-    def run(low: int, high: int) -> None:
-        sums.extend(float(tensor[low:high].sum()) for tensor in tensors)
-
-    in_slices(run, torch_slices(len(tensors[0])))
-    return math.isfinite(sum(sums))
+def _clear(tensors: Tensors, lanes: int) -> Pass:
+    """Set rows of dense ``tensors`` to zero; on a GPU in one launch."""
+    rows_of = lambda low, high: [tensor[lanes * low : lanes * high] for tensor in tensors]  # noqa: E731
+    return lambda low, high: torch._foreach_zero_(rows_of(low, high))  # pyright: ignore[reportPrivateImportUsage]

@@ -109,16 +109,25 @@ def launch(
         device: of the tensors behind ``inputs`` and ``outputs``.
         adjoint: ``adj_inputs`` and ``adj_outputs`` to run the generated adjoint instead.
     """
-    if dim == 0:
-        return
+    if dim > 0:
+        whole = torch.device(device).type == "cuda"
+        in_slices(bind(kernel, inputs, outputs, device, **adjoint), [0, dim] if whole else bounds or even_slices(dim))
+
+
+def bind(
+    kernel: wp.Kernel, inputs: Sequence, outputs: Sequence, device: torch.device | str, **adjoint
+) -> Callable[[int, int], None]:
+    """A function that runs a slice of ``kernel``, with arguments as :func:`launch` takes them.
+
+    So work on the same rows can share a slice, one after the other: threads wait for each other once, not each time.
+    """
     if adjoint:
         adjoint = {"adjoint": True, "adj_inputs": [None, *adjoint["adj_inputs"]], "adj_outputs": adjoint["adj_outputs"]}
     if torch.device(device).type == "cuda":
-        wp.launch(kernel, dim, [0, *inputs], outputs, stream=_stream(device), record_tape=False, **adjoint)
-        return
-
+        options = {"stream": _stream(device), "record_tape": False, **adjoint}
+        return lambda low, high: wp.launch(kernel, high - low, [low, *inputs], outputs, **options)
     load("cpu", kernel)
-    in_slices(_bound(kernel, [0, *inputs], outputs, adjoint), bounds or even_slices(dim))
+    return _bound(kernel, [0, *inputs], outputs, adjoint)
 
 
 #: By kernel, and whether its adjoint: its module, which stays loaded; a function; tables of what that is given.

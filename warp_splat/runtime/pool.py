@@ -194,12 +194,3 @@ def at_once(*calls: Callable[[], Any]) -> list:
     found: dict[int, Any] = {}
     in_slices(lambda number, _: found.update({number: calls[number]()}), list(range(len(calls) + 1)))
     return [found[number] for number in range(len(calls))]
-
-
-def set_zero(*tensors: torch.Tensor) -> None:
-    """Set all numbers of dense ``tensors``, N rows each, to zero on the threads of the CPU; on a GPU, in one launch."""
-
-    def run(low: int, high: int) -> None:
-        torch._foreach_zero_([tensor[low:high] for tensor in tensors])  # pyright: ignore[reportPrivateImportUsage]
-
-    in_slices(run, torch_slices(len(tensors[0]), tensors[0].device))
