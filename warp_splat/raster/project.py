@@ -253,14 +253,14 @@ class Project(torch.autograd.Function):
             adj_placed = torch.zeros_like(adj_means) if wants_pose else adj_means  # else added to the colors' part
             outputs, adj_outputs = _geometry(splats), _geometry(adj_splats)
             geometry, shared = _geometry_of(it, given[:4], outputs, [adj_placed, *shapes], adj_outputs)
-            sums: list[float] = []
+            totals: list[float] = []
 
             def total(low: int, high: int) -> None:
                 rows = slice(lanes * low, lanes * high)
                 if wants_pose:
                     adj_means[rows] += adj_placed[rows]
                 if it.driver.peeks:
-                    sums.extend(float(tensor[rows].sum()) for tensor in adj[:5])
+                    totals.extend(float(tensor[rows].sum()) for tensor in adj[:5])
 
             _in_turn([shade, _clear(shapes, lanes), geometry, total], count, lanes, device)
             adj_twist = adj_intrinsics = adj_last = adj_coefficients = None
@@ -280,7 +280,7 @@ class Project(torch.autograd.Function):
             if it.bend:
                 adj_coefficients = cameras.coefficients_gradient(it.camera.lens, shared, coefficients)
             # a GPU would have to stop for the answer; sh_rest's are multiples of those of sh_dc
-            if not (it.driver.peeks and math.isfinite(sum(sums))):
+            if not (it.driver.peeks and math.isfinite(sum(totals))):
                 bad = torch.zeros_like(splats.radii)
                 types = (wp.vec3, wp.vec4, wp.vec3, wp.float32, wp.vec3, wp.vec3, wp.int32)
                 outputs = [view(tensor, dtype) for tensor, dtype in zip((*adj, bad), types, strict=True)]

@@ -116,7 +116,7 @@ def launch(
 
 def bind(
     kernel: wp.Kernel, inputs: Sequence, outputs: Sequence, device: torch.device | str, **adjoint
-) -> Callable[[int, int], None]:
+) -> Callable[[int, int], object]:
     """A function that runs a slice of ``kernel``, with arguments as :func:`launch` takes them.
 
     So work on the same rows can share a slice, one after the other: threads wait for each other once, not each time.
@@ -164,7 +164,9 @@ def _packed(kernel: wp.Kernel, table: type[ctypes.Structure], values: Sequence) 
     """Arguments of ``kernel`` as it reads them, or adjoints; Warp checks all but numbers and what :func:`view` made."""
     known, pairs = (_Array, int, float), zip(kernel.adj.args, values, strict=True)
     given = (v if isinstance(v, known) else _pack(kernel, a.type, a.label, v, "cpu", v is None) for a, v in pairs)
-    return table(*given)
+    packed: Any = table(*given)
+    packed._ref = values  # whose memory nobody else may keep
+    return packed
 
 
 def open_tape() -> wp.Tape | None:
@@ -206,19 +208,25 @@ def launch_in_lanes(
     Returns:
         Those numbers, a row for each index of both kernels; none, if not asked for.
     """
-    whole, done = count - count % lanes, 0
-    parts = [(lanes, slice(0, whole)), (1, slice(whole, count))]
-    parts = [(size, rows, -(-((rows.stop - rows.start) // size) // run)) for size, rows in parts]
-    rows_of_sums, columns = sum(runs for *_, runs in parts), sums[0] if sums else 0
-    found = torch.empty(rows_of_sums, columns, dtype=torch.float32, device=device)
-    for size, rows, runs in parts:
-        if runs:
-            bounds = even_slices(runs, each=size * run)
-            given, made = ([_in_lanes(t, TYPES[size], count, rows) for t in tables] for tables in (inputs, outputs))
-            if sums:
-                made.append(view(found[done : done + runs], sums[1]))
-            launch(make(size), runs, given, made, bounds=bounds, device=device)
-            done += runs
+    whole = count - count % lanes
+    most, left = -(-(whole // lanes) // run), -(-(count - whole) // run)
+    found = torch.empty(most + left, sums[0] if sums else 0, dtype=torch.float32, device=device)
+    if count == 0:
+        return found
+
+    def bound(size: int, rows: slice, indices: slice) -> Callable[[int, int], object]:
+        given, made = ([_in_lanes(t, TYPES[size], count, rows) for t in tables] for tables in (inputs, outputs))
+        return bind(make(size), given, [*made, *([view(found[indices], sums[1])] if sums else [])], device)
+
+    def run_slice(low: int, high: int) -> None:
+        if low < most:
+            in_groups(low, min(high, most))
+        if high > most:  # while other threads are still at work
+            bound(1, slice(whole, count), slice(most, None))(max(low - most, 0), high - most)
+
+    in_groups = bound(lanes, slice(0, whole), slice(0, most))
+    cuda = torch.device(device).type == "cuda"
+    in_slices(run_slice, [0, most + left] if cuda else even_slices(most + left, each=lanes * run))
     return found
 
 
