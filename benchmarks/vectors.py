@@ -14,7 +14,7 @@ from arm import DEFAULT_ROOT, kernel_folders
 from common import option, parse, write_table
 
 #: Kernels whose loops take the time of a step.
-HOT = ("project", "shade", "adj_shade", "blend", "upstream", "adj_blend", "walk", "compare", "adj_compare", "adam")
+HOT = ("project", "shade", "adj_shade", "blend", "upstream", "adj_blend", "walk", "ssim", "adam")
 #: Floating-point arithmetic. On x86-64 the name says whether it is packed, on ARM the operands do.
 X86 = re.compile(r"v?(?:add|sub|mul|div|sqrt|min|max|fn?m(?:add|sub)\d+)([ps])[sd]")
 ARM = re.compile(r"f(?:add|sub|mul|div|sqrt|min|max|minnm|maxnm|mla|mls|madd|msub|nmadd|nmsub|nmul|neg|abs)")

@@ -145,7 +145,8 @@ class Trainer:
         options = self.options_at(step)
         camera, background = self._through("camera", camera, step), self._through("background", self.background, step)
         out, rows = self._render(camera, background, options, room=self.room, splats=splats)
-        out.means2d.retain_grad()
+        kept: list[torch.Tensor] = []
+        out.means2d.register_hook(kept.append)  # retain_grad would copy it
         image = self._through("image", out.image, out, step)
         photograph = self._through("photograph", photograph, step)
         target = photograph.image
@@ -159,6 +160,7 @@ class Trainer:
             loss = loss + price.to(loss.dtype)
         loss.backward()  # given a gradient, torch would load sympy, for over a second
         if not splats:
+            out.means2d.grad = kept[0] if kept else None
             self.see(out if rows is None else Observed.of_all(out, rows, len(self.model)), step)
         dropped = (out.dropped.pixel_count, out.dropped.gaussian_count, out.invalid_count)
         self.dropped.update(dict(zip(NOT_FINITE, dropped, strict=True)))
