@@ -26,6 +26,7 @@ from warp_splat.cli import main, parse
 from warp_splat.config import SfmConfig
 from warp_splat.formats.png import save_video
 from warp_splat.scene import load_scene
+from warp_splat.scene.images import read_pixels
 from warp_splat.sfm import matching, stages
 from warp_splat.sfm.command import _claim, scene_for, sfm
 from warp_splat.sfm.video import sample_frames
@@ -97,15 +98,24 @@ def test_a_lens_is_each_groups_own_where_a_run_goes_on(photos, tmp_path):
     assert lenses[0] == lenses[1] != lenses[2] == lenses[3]
 
 
-def test_photographs_may_keep_their_lens(photos, scene, tmp_path):
-    config = SfmConfig(str(photos[0]), str(tmp_path), keep_lens=True, quiet=True)
-    stages.write_scene(scene / "sfm" / "models" / "0", photos[0], tmp_path, tmp_path / "part", COUNT, config)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["images", "sparse"]
-    lines = []
+@pytest.mark.parametrize("why", ["asked", "alpha", "light"])
+def test_photographs_keep_their_lens(photos, scene, tmp_path, capsys, why):
+    """If that is asked, or undistortion would take something of them; then training undistorts them."""
+    root, linear = tmp_path / "photos", [("oiio:ColorSpace", "lin_rec709")] * (why == "light")
+    for path in photos[0].iterdir():
+        pixels = read_pixels(path, 0.0).color
+        pixels = np.dstack([pixels, pixels[..., :1] > 0.5]) if why == "alpha" else pixels
+        write_image(root / path.name, (65535 * pixels**1.5).astype(np.uint16), linear)
+    config = SfmConfig(str(root), str(tmp_path), keep_lens=why == "asked")
+    stages.write_scene(scene / "sfm" / "models" / "0", root, tmp_path, tmp_path / "part", COUNT, config)
+    assert ("few" if why == "asked" else "photo_0.png, photo_1.png") in capsys.readouterr().out + "few"
+    lines, loaded = [], load_scene(tmp_path)
+    assert (loaded.linear, loaded.train[0].alpha is not None) == (why == "light", why == "alpha")
+    assert loaded.train[0].camera.lens is None and (len(np.unique(loaded.train[0].image)) > 256) == (why == "light")
     views = load_scene(tmp_path, lens="native", report=lines.append).train
     assert len(views) == COUNT and all(view.camera.lens for view in views) and "Keeping" in lines[-1]
     for view in views:
-        assert (tmp_path / "images" / view.name).read_bytes() == (photos[0] / view.name).read_bytes()
+        assert (tmp_path / "images" / view.name).read_bytes() == (root / view.name).read_bytes()
 
 
 def test_the_scene_is_said_to_be_complete(photos, scene, tmp_path, capsys):

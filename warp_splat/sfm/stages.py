@@ -23,6 +23,8 @@ from warp_splat.config import SfmConfig
 from warp_splat.errors import InputError
 from warp_splat.runtime.interrupts import interruptible, leave
 from warp_splat.scene.colmap_library import pycolmap
+from warp_splat.scene.images import read_kind
+from warp_splat.text import few
 
 LENS = "OPENCV"  # fx, fy, cx, cy, two radial and two tangential coefficients: what phones and cameras need
 POLL = 0.3  # seconds
@@ -108,12 +110,19 @@ def extract(database: Path, root: Path, groups: list[list[str]], config: SfmConf
 def write_scene(model: Path, root: Path, scene: Path, part: Path, count: int, config: SfmConfig) -> None:
     """Write the photographs to ``scene``/images and their cameras to ``scene``/sparse/0.
 
-    Without distortion, and pinholes; with ``config.keep_lens`` as they are.
+    Without distortion, and pinholes; as they are with ``config.keep_lens``, or if undistortion would lose something.
     """
     shutil.rmtree(part, ignore_errors=True)
     shutil.rmtree(scene / "images", ignore_errors=True)  # of a run that was stopped before sparse/ got its name
     undistort = partial(pycolmap.undistort_images, num_threads=config.threads)
-    title, write = ("copies", _copy) if config.keep_lens else ("undistortion", undistort)
+    names = sorted(image.name for image in pycolmap.Reconstruction(str(model)).images.values())
+    lost = [name for name in names if any(read_kind(root / name))]  # pycolmap knows bytes of three channels
+    if lost and not (config.keep_lens or config.quiet):
+        tqdm.write(
+            f"Photographs stay as they are, with their lens: {few(lost)} may have linear light or alpha, which "
+            "undistortion would lose; training undistorts them as it loads them."
+        )
+    title, write = ("copies", _copy) if config.keep_lens or lost else ("undistortion", undistort)
 
     def written() -> int:
         return sum(path.is_file() for path in (part / "images").rglob("*")) if part.is_dir() else 0
