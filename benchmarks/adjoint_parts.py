@@ -13,10 +13,9 @@ from unittest.mock import patch
 import torch
 import warp as wp
 import work
-from common import REPEATS, SCENE, TRAINED, parse, write_table
+from common import REPEATS, SCENE, TRAINED, load_model, parse, write_table
 
 from warp_splat.config import RasterOptions
-from warp_splat.gaussians import GaussianModel
 from warp_splat.kernels import falloff, step
 from warp_splat.kernels.cpu import adjoint
 from warp_splat.kernels.inline import defined
@@ -69,7 +68,7 @@ def make(changes: tuple):
 def main() -> None:
     arguments = parse(__doc__, TRAINED, SCENE, REPEATS)
     launch.prepare("cpu", 1)
-    model = GaussianModel.load(arguments.models[0]).arranged()
+    model = load_model(arguments.models[0]).arranged()
     camera = load_scene(arguments.scene, eval=True).test[0].camera
     options, seconds, differentiate = RasterOptions(), {}, Driver.differentiate
     counts = work.count(model.activated(), camera, options)

@@ -16,6 +16,7 @@ import warp as wp
 from warp_splat.color import to_bytes
 from warp_splat.config import RasterOptions
 from warp_splat.evaluation.report import machine
+from warp_splat.formats.exchange import load_gaussians
 from warp_splat.gaussians import GaussianModel
 from warp_splat.raster.drivers import DRIVERS, Driver
 from warp_splat.rendering.finished import make_renderer
@@ -49,6 +50,11 @@ def parse(doc: str | None, *options: tuple) -> argparse.Namespace:
         parser.add_argument(*names, **how)
     parser.add_argument("--out", type=Path, help="folder for the table, as .md and .json, and for plots")
     return parser.parse_args()
+
+
+def load_model(path: Path) -> GaussianModel:
+    """The Gaussians of a file. Raises InputError if it is missing or not one."""
+    return GaussianModel.from_splats(load_gaussians(path).splats)
 
 
 def run_training(model: Path, flags: Iterable) -> dict:

@@ -15,13 +15,12 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from common import ROOT, option, parse, write_table
+from common import ROOT, load_model, option, parse, write_table
 
 from warp_splat.camera import Camera
 from warp_splat.compare import oracle
 from warp_splat.compare.stability.verdict import EPS
 from warp_splat.config import ALPHA_MIN, RasterOptions
-from warp_splat.gaussians import GaussianModel
 from warp_splat.raster.data import Gaussians
 from warp_splat.raster.project import project
 from warp_splat.runtime import launch
@@ -106,7 +105,7 @@ def views_of(arguments: argparse.Namespace) -> Iterator[tuple[str, Gaussians, Ca
     for folder, model in zip(arguments.scenes, arguments.models, strict=True):
         scene = load_scene(folder, resolution=arguments.width, eval=True, report=str)
         with torch.no_grad():
-            gaussians = GaussianModel.load(model).arranged().activated()
+            gaussians = load_model(model).arranged().activated()
         yield Path(folder).name, gaussians, scene.train[0].camera
 
 

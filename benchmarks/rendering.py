@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from common import interleaved, option, parse, picture_of, write_table
+from common import interleaved, load_model, option, parse, picture_of, write_table
 
 from warp_splat import rasterize, rasterize_views
 from warp_splat.config import RasterOptions
@@ -71,7 +71,7 @@ def main() -> None:
     launch.prepare("cpu", 0)
     scene = load_scene(arguments.scene, eval=True, report=lambda _: None)
     cameras, rows = focus_orbit(scene, FRAMES), []
-    models = [GaussianModel.load(path).arranged() for path in arguments.models]
+    models = [load_model(path).arranged() for path in arguments.models]
     for model in models:
         rows += measure(model, list(OPTIONS) if model is models[0] else [FULL], cameras, scene.test)
     calls = compare_calls(models[0], cameras)

@@ -19,7 +19,7 @@ from collections.abc import Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
 
-from common import option, parse, write_table
+from common import load_model, option, parse, write_table
 from gpu_steps import STAGES
 from limits import Limits, measure_limits
 from made_up import VIEWS, make_gaussians, make_scene, steps_of, trainer_on
@@ -27,7 +27,6 @@ from work import Counts, count, mean, work_of
 
 from warp_splat.config import RasterOptions
 from warp_splat.formats.model_folder import ply_path
-from warp_splat.gaussians import GaussianModel
 from warp_splat.raster.data import Gaussians
 from warp_splat.runtime import launch, pool, timers
 from warp_splat.scene import load_scene
@@ -52,7 +51,7 @@ def trained(source: Path, models: Path, name: str) -> Trainer:
     resolution, iteration = TRAINED[name]
     scene = load_scene(source, resolution=resolution, eval=True, report=lambda *_: None)
     scene = replace(scene, train=scene.train[:: len(scene.train) // VIEWS][:VIEWS])
-    return trainer_on(scene, GaussianModel.load(ply_path(models / name, iteration)), "cpu", **AT_REST)
+    return trainer_on(scene, load_model(ply_path(models / name, iteration)), "cpu", **AT_REST)
 
 
 def synthetic(count: int, width: int, height: int) -> Trainer:

@@ -225,7 +225,7 @@ def test_resume_of_a_start_from_a_file(gone, tmp_path, monkeypatch, capsys):
     root = write_colmap(tmp_path / "scene", points=())
     save_gaussians("start.ply", SplatFile(some_splats(50)))
     begin = ["train", "-s", str(root), "--start_ply", "start.ply", "--viewer", "--port", "1234", "-m"]
-    monkeypatch.setattr("warp_splat.training.command._watched", lambda *_: nullcontext())
+    monkeypatch.setattr("warp_splat.training.command.watched", lambda *_: nullcontext())
     assert main([*begin, "whole", "--iterations", "6"]) == 0
     with monkeypatch.context() as patch:
         interrupt(patch, 1)

@@ -16,7 +16,7 @@ from warp_splat.camera import Camera
 from warp_splat.color import to_srgb
 from warp_splat.compare.oracle import sh_basis
 from warp_splat.errors import InputError
-from warp_splat.formats.exchange import save_gaussians
+from warp_splat.formats.exchange import load_gaussians, save_gaussians
 from warp_splat.formats.model_folder import ply_path, read_environment, write_cfg_args
 from warp_splat.gaussians import GaussianModel
 from warp_splat.lenses import Lens
@@ -44,7 +44,7 @@ def test_what_is_saved_looks_as_in_training(trained, scene):
     harmonics, camera = read_environment(folder, 12), scene.train[0].camera
     assert (harmonics != 0).all() and np.array_equal(harmonics, trainer.behind.numpy())
     assert np.array_equal(read_environment(ply_path(folder, 12), 0), harmonics)
-    model = GaussianModel.load(ply_path(folder, 12))
+    model = GaussianModel.from_splats(load_gaussians(ply_path(folder, 12)).splats)
     shown, without = (picture_of(model, some, trainer.options)(camera) for some in (trainer.behind, None))
     trainer.model = trainer.model.arranged()
     found = picture_of(trainer.model, trainer.behind, trainer.options)(camera)

@@ -14,6 +14,7 @@ from torch.nn import functional
 from warp_splat.camera import Camera
 from warp_splat.cli import main
 from warp_splat.color import to_bytes
+from warp_splat.formats.exchange import load_gaussians
 from warp_splat.formats.model_folder import ply_path
 from warp_splat.formats.png import load_png
 from warp_splat.gaussians import GaussianModel
@@ -88,7 +89,7 @@ def test_view(scene, model, tmp_path):
     """
     shot = lambda: screenshot(page, tmp_path)  # noqa: E731
     view = scene.train[0]
-    draw = make_renderer(GaussianModel.load(model))
+    draw = make_renderer(GaussianModel.from_splats(load_gaussians(model).splats))
     camera, box = framed(view.camera, WIDTH, HEIGHT)
     wanted = to_bytes(draw(camera, False).image)
     aside = Camera(WIDTH, HEIGHT, camera.fx, camera.fy, camera.cx + 1, camera.cy, camera.rotation, camera.translation)

@@ -10,7 +10,6 @@ import torch
 from torch.autograd.function import once_differentiable
 
 from warp_splat.formats.curve import along_curve, keys_of
-from warp_splat.formats.exchange import load_gaussians
 from warp_splat.formats.ply import save_ply_parts
 from warp_splat.formats.splats import SplatArrays
 from warp_splat.kernels.activation import make_activate, make_adj_activate
@@ -173,11 +172,6 @@ class GaussianModel:
         """Write a PLY file in the reference's layout, arranged; a part after another, since memory may be short."""
         parts = along_curve(self.parameters["means"].cpu()).split(CHUNK)
         save_ply_parts(path, len(self), map(self.splats, parts), antialiased)
-
-    @classmethod
-    def load(cls, path: Path) -> GaussianModel:
-        """Read a file of Gaussians. Raises InputError if it is missing or not one."""
-        return cls.from_splats(load_gaussians(path).splats)
 
     @classmethod
     def from_splats(cls, splats: SplatArrays, sh_degree: int | None = None) -> GaussianModel:

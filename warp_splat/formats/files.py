@@ -42,22 +42,21 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
     try:
         if path.is_dir() and not path.is_symlink():  # before files that belong to it are written
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            yield temporary
-            # Some file systems report a full disk only here; without it a power cut could leave an empty file.
-            with open(temporary, "r+b") as file:
-                os.fsync(file.fileno())
-            os.replace(temporary, path)
-        finally:
-            with suppress(OSError):  # failing to tidy up must not hide the error that made it necessary
-                temporary.unlink(missing_ok=True)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        yield temporary
+        # Some file systems report a full disk only here; without it a power cut could leave an empty file.
+        with open(temporary, "r+b") as file:
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
     except OSError as error:
         older = "; an older file of this name is untouched" if os.path.isfile(path) else ""
         raise InputError(
             f"{path}: could not be written ({error.strerror or error}){older}. "
             f"{'Free some space or choose' if error.errno in FULL else 'Choose'} another folder."
         ) from error
+    finally:
+        with suppress(OSError):  # failing to tidy up must not hide the error that made it necessary
+            temporary.unlink(missing_ok=True)
 
 
 def write_text(path: str | Path, text: str) -> None:

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -21,6 +20,8 @@ from warp_splat.runtime.launch import launch_in_lanes, send
 from warp_splat.runtime.sums import in_pairs
 
 LONGEST = 2.0 * math.pi  # rotation vector; a longer one says what a shorter one does
+#: A gradient of a pose, in the camera's axes: [3] about the camera's center, [3] of the shift of the world.
+Tangent = tuple[np.ndarray, np.ndarray]
 
 
 class CameraParameters:
@@ -121,13 +122,6 @@ def _checked(name: str, tensor: torch.Tensor | None, start: list[float]) -> torc
     return tensor
 
 
-class Tangent(NamedTuple):
-    """A gradient of a pose, in the camera's axes."""
-
-    turn: np.ndarray  # [3] about the camera's center
-    shift: np.ndarray  # [3] of the world
-
-
 def sums_of(make: Callable[[int], wp.Kernel], lanes: int, columns: int, inputs: list) -> torch.Tensor:
     """The columns of what a kernel writes of all Gaussians, summed in pairs in float64, in one order everywhere."""
     count, device = len(inputs[1]), inputs[1].device
@@ -138,13 +132,13 @@ def twist_gradient(
     camera: Camera, learned: CameraParameters, motion: np.ndarray, which: int, sums: np.ndarray
 ) -> np.ndarray:
     """Of the first or the last twist [6], from the sums over all Gaussians [6] and the gradient of the motion."""
-    turn, shift = ((camera.rotation * part).T for part in (sums[:3], sums[3:]))
-    middle = Tangent(*(part[0] + part[1] + part[2] for part in (turn, shift)))
-    pose = pose_gradients(camera.shutter, middle, motion)[which]
+    columns = ((camera.rotation * part).T for part in (sums[:3], sums[3:]))
+    turn, shift = (part[0] + part[1] + part[2] for part in columns)
+    turn, shift = pose_gradients(camera.shutter, (turn, shift), motion)[which]
     now = _numbers((learned.twist, learned.last_twist)[which])
-    turn = pose.turn - cross(now[3:], pose.shift)
+    turn = turn - cross(now[3:], shift)
     turn = rotated(turn, -now[:3], 2)  # by the left Jacobian of the rotation, transposed
-    return np.concatenate([turn, pose.shift])
+    return np.concatenate([turn, shift])
 
 
 def of_sums(
@@ -236,11 +230,11 @@ def pose_gradients(shutter: Shutter | None, middle: Tangent, motion: np.ndarray)
         return middle, middle
     w, shift = np.array(shutter.turn), np.array(shutter.shift)
     by_turn, by_shift = motion[:, :3]
-    turn = middle.turn + cross(shift, by_shift)
+    turn = middle[0] + cross(shift, by_shift)
     by_turn = by_turn + 0.5 * rotated(turn, -0.5 * w, 2)
-    half = 0.5 * middle.shift
-    first = Tangent(rotated(turn, -0.5 * w, 1) - _before_jacobian(w, by_turn), rotated(half + by_shift, -0.5 * w, 1))
-    return first, Tangent(_before_jacobian(-w, by_turn), rotated(half - by_shift, 0.5 * w, 1))
+    half = 0.5 * middle[1]
+    first = rotated(turn, -0.5 * w, 1) - _before_jacobian(w, by_turn), rotated(half + by_shift, -0.5 * w, 1)
+    return first, (_before_jacobian(-w, by_turn), rotated(half - by_shift, 0.5 * w, 1))
 
 
 def _before_jacobian(w: np.ndarray, vector: np.ndarray) -> np.ndarray:

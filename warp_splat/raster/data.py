@@ -3,8 +3,6 @@
 N Gaussians, V splats, M tile instances (a splat in the list of a tile), T tiles, H x W pixels.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """``warp-splat sfm``: photographs or a video in, a scene to train on out, and what came of it."""
 
-from __future__ import annotations
-
 import json
 import os
 import shlex

@@ -3,8 +3,6 @@
 What is matched is in the database at once. So a run that was stopped goes on at the next block of pairs.
 """
 
-from __future__ import annotations
-
 import ctypes
 import sys
 from collections.abc import Callable

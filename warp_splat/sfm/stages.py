@@ -7,8 +7,6 @@ What shows the progress of a stage opens the database before the stage begins: o
 refuse another. Python's sqlite3 would do harm: it drops the locks of pycolmap's copy of SQLite.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 import sys

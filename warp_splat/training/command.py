@@ -1,14 +1,12 @@
 """A whole training run: scene in; model, pictures, plots and numbers out."""
 
-from __future__ import annotations
-
 import math
 import os
 import sys
 import time
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from tqdm import tqdm
@@ -28,6 +26,7 @@ from warp_splat.scene.start import load_start
 from warp_splat.text import Report
 from warp_splat.training import memory, opening
 from warp_splat.training.deadline import plan_training
+from warp_splat.training.live import TrainingViewer, watched
 from warp_splat.training.loop import train_steps
 from warp_splat.training.options import TrainConfig, check_train
 from warp_splat.training.parts import PARTS
@@ -35,9 +34,6 @@ from warp_splat.training.record import Run, finish, how_to_continue, keep, resto
 from warp_splat.training.tensorboard import EventLog
 from warp_splat.training.trainer import Trainer
 from warp_splat.training.trial import settle_parts
-
-if TYPE_CHECKING:
-    from warp_splat.training.live import TrainingViewer
 
 #: Options that may differ between processes that train together.
 OWN = {"source_path", "start_ply", "start_checkpoint", "config", "model_path", "lpips_weights", "verify"}
@@ -116,7 +112,7 @@ def _train(config: TrainConfig, processes: Processes) -> int:
     _tell(trainer, run, say)
     with model_folder.claimed(run.folder) if processes.rank == 0 else nullcontext(), _memory_explained(trainer):
         _restore_or_begin(trainer, run, begun, say)
-        with _watched(trainer, run) as viewer:
+        with watched(trainer, run) if config.report.viewer else nullcontext() as viewer:
             return _run(trainer, run, viewer) or _finish(trainer, run, viewer, say)
 
 
@@ -210,15 +206,6 @@ def _finish(trainer: Trainer, run: Run, viewer: TrainingViewer | None, say: Repo
             "option or kind of device makes another model, see docs/platforms.md."
         )
     return 0
-
-
-def _watched(trainer: Trainer, run: Run) -> AbstractContextManager[TrainingViewer | None]:
-    """The viewer, if one is asked for."""
-    if not trainer.config.report.viewer:
-        return nullcontext()
-    from warp_splat.training.live import watched  # noqa: PLC0415 - viser takes half a second to load
-
-    return watched(trainer, run)
 
 
 def _memory_explained(trainer: Trainer):

@@ -7,7 +7,6 @@ checkpoints are written, and the viewer draws. This page and those two methods a
 
 import sys
 import time
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -17,11 +16,9 @@ from warp_splat.errors import InputError
 from warp_splat.formats.png import save_png
 from warp_splat.runtime import timers
 from warp_splat.training.deadline import APART, Deadline
+from warp_splat.training.live import TrainingViewer
 from warp_splat.training.record import Run, keep, save_or_warn, warn
 from warp_splat.training.trainer import Trainer
-
-if TYPE_CHECKING:
-    from warp_splat.training.live import TrainingViewer
 
 EVALUATIONS = 20  # over the run, at most, besides --test_iterations
 PROGRESS_VIEWS = 8  # at most, in the evaluations while training
@@ -29,7 +26,7 @@ PREVIEW_SECONDS = 5.0
 KEEP, STOP = 1, 2  # what a process may wish after a step: a checkpoint, an end
 
 
-def train_steps(trainer: Trainer, run: Run, interrupted: list[int], viewer: "TrainingViewer | None") -> None:
+def train_steps(trainer: Trainer, run: Run, interrupted: list[int], viewer: TrainingViewer | None) -> None:
     """Train until the last step, or until Ctrl-C has put a signal into ``interrupted``."""
     report, processes = trainer.config.report, trainer.processes
     deadline = Deadline(trainer.config.learn, trainer.photographs.shares, processes.images)

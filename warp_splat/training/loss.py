@@ -28,6 +28,7 @@ LOSS_CURVES = {
 }
 FAR_APART = 10.0  # in units of an image's usual range
 SMALLEST_SLICE = 64  # rows; besides its own, a slice blurs ten of its neighbors'
+HALVES = functools.cache(functools.partial(torch.full, (2,), 0.5))  # by device: the centers of images of bytes
 
 
 def image_loss(
@@ -196,14 +197,9 @@ def _centers(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
     One number for both unless they lie far apart, so that equal pixels stay equal.
     """
     if target.dtype == torch.uint8:
-        return _halves(image.device)
+        return HALVES(device=image.device)
     own, other = _middle(image), _middle(target)
     return torch.stack([torch.where((own - other).abs() > FAR_APART, own, other), other])
-
-
-@functools.cache
-def _halves(device: torch.device) -> torch.Tensor:
-    return torch.full((2,), 0.5, device=device)
 
 
 def _middle(image: torch.Tensor) -> torch.Tensor:

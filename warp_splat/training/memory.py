@@ -8,8 +8,6 @@ to 1.13 of them over its sweeps. Tried:
   live in pieces of the heap that are there anyhow; it took 0.3 to 1.3 s.
 """
 
-from typing import TYPE_CHECKING
-
 import psutil
 import torch
 
@@ -17,9 +15,7 @@ from warp_splat.config import TILE
 from warp_splat.runtime.launch import available_memory
 from warp_splat.training.options import TrainConfig
 from warp_splat.training.seams import having
-
-if TYPE_CHECKING:
-    from warp_splat.training.trainer import Trainer
+from warp_splat.training.trainer import Trainer
 
 FLOAT, GIB = 4, 2**30  # bytes
 INSTANCES = 3  # of a Gaussian, guessed: 1.4 to 2.8 on photographs of 270 x 480 and 540 x 960 px
@@ -54,7 +50,7 @@ def step_memory(gaussians: int, instances: int, pixels: int, config: TrainConfig
     return FLOAT * (gaussians * of_gaussian + instances * of_instance + pixels * per_pixel)
 
 
-def describe(trainer: "Trainer") -> tuple[str, bool]:
+def describe(trainer: Trainer) -> tuple[str, bool]:
     """What to tell the user once kernels are loaded, memory and the Gaussians assumed, and whether that can be had."""
     scene, config, processes = trainer.scene, trainer.config, trainer.processes.local_count
     pixels = max(view.camera.width * view.camera.height for view in scene.train)
