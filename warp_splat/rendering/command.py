@@ -78,8 +78,11 @@ def save_exr(path: Path, values: np.ndarray) -> None:
     spec.attribute("DateTime", "1970:01:01 00:00:00")  # else that of writing, and other bytes
     with atomic_write(path) as new:
         output = oiio.ImageOutput.create(str(new))
-        if not (output and output.open(str(new), spec) and output.write_image(values[..., None]) and output.close()):
-            found = oiio.geterror() or output.geterror()
+        done = output and output.open(str(new), spec) and output.write_image(values[..., None]) and output.close()
+        # a disk that becomes full with the last bytes is no error of OpenImageIO's
+        read = oiio.ImageBuf(str(new)).get_pixels(oiio.FLOAT) if done else None
+        if not np.array_equal(read, values[..., None].astype(np.float32)):
+            found = oiio.geterror() or output.geterror() or "it does not hold what was written, the disk may be full"
             raise InputError(f"{path}: it cannot be written: {found}; name another folder.")
 
 

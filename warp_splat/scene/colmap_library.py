@@ -2,6 +2,8 @@
 
 import signal
 
+import OpenImageIO  # noqa: F401 - before pycolmap: after it, whose libraries clash with its own, writing a PNG crashes
+
 from warp_splat.errors import InputError
 from warp_splat.runtime.interrupts import interruptible
 
@@ -13,7 +15,6 @@ with interruptible() as interrupted:
         pycolmap = None  # type: ignore
 for number in interrupted:  # for the handler of whoever loads this
     signal.raise_signal(number)
-import OpenImageIO  # noqa: E402, F401 - after pycolmap, whose libraries clash with its own, writing a PNG would crash
 
 
 def require_pycolmap(what: str) -> None:

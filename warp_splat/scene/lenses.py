@@ -69,8 +69,8 @@ def make_photo(
         if not finite or (loaded := lens.load()).is_spherical():
             raise InputError(
                 "expected a camera model that can be undistorted to a pinhole, with finite parameters, got "
-                f"{lens.model} {list(lens.params)}; correct the model, leave this image out, or keep its lens "
-                "(train with --lens native)."
+                f"{lens.model} {np.asarray(lens.params).tolist()}; correct the model, leave this image out, or "
+                "keep its lens (train with --lens native)."
             )
         if loaded.is_undistorted() and "FISHEYE" not in lens.model:  # of those it means: no more than its angles
             return Photo(name, path, _pinhole(loaded, pose).resized(*size))
