@@ -64,6 +64,8 @@ class Blend(torch.autograd.Function):
         pixels, saved = blending.driver.blend(blending.bins, blending.camera, background, options, keep)
         blending.saved = saved._replace(kept=background.new_empty(0))
         ctx.save_for_backward(background, *saved)
+        ctx.shapes = [tensor.shape for tensor in pixels]
+        ctx.set_materialize_grads(False)  # but one zero for all, where none comes
         return tuple(pixels)
 
     @staticmethod
@@ -71,7 +73,11 @@ class Blend(torch.autograd.Function):
     def backward(ctx, *adj_pixels):
         with stage("adjoint of blend"):
             (background, *saved), it = ctx.saved_tensors, ctx.blending
-            adj_pixels = Pixels(*(adj.contiguous().resolve_neg() for adj in adj_pixels))
+            nothing = background.new_zeros(())
+            given = zip(adj_pixels, ctx.shapes, strict=True)
+            adj_pixels = Pixels(
+                *(nothing.expand(shape) if adj is None else adj.contiguous().resolve_neg() for adj, shape in given)
+            )
             slots, adj_background, dropped = it.driver.adjoint(
                 it.adjoint, it.bins, it.options, background, Saved(*saved), adj_pixels
             )
