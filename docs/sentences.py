@@ -277,6 +277,23 @@ def _captures() -> list[tuple]:
 
 
 #: By page: pieces of its text, with ``{}`` for a figure, and the figures.
+def _gradients() -> list[tuple]:
+    found = f.data("numerics")["rows"]
+    of = lambda what, key="measured": [row[key] for row in found if re.search(what, row["what"])]  # noqa: E731
+    cuts, stops = of("by the cut"), of("by the stop")
+    return [
+        ("that of rounding: {} to {} % of", *f.span([100 * cut for cut in cuts], "{:.0f}".format)),
+        ("that with the cut is {} to {} times as", *f.span(of("by the cut", "along"), f.two)),
+        (
+            "The stop matters {} to {} times",
+            *f.span([cut / stop for cut, stop in zip(cuts, stops, strict=True)], "{:.0f}".format),
+        ),
+        ("pixel by {} in the mean", f.small(max(of("what one changes")))),
+        ("the brightest color, {} to {}. No", *f.span(of("what one changes", "bound"), f.small)),
+        ("Two orders are\n{} apart", f.small(f.mean(of("two such sums")))),
+    ]
+
+
 SENTENCES = {
     "scaling.md": _scaling,
     "README.md": _readme,
@@ -290,6 +307,7 @@ SENTENCES = {
     "cameras.md": _cameras,
     "cuda.md": _cuda,
     "captures.md": _captures,
+    "gradients.md": _gradients,
 }
 
 
