@@ -272,6 +272,7 @@ def test_a_name_may_get_another_formula(monkeypatch):
         ("found one by if, and, or", lambda k, _: 2.0 if k[0] > 0 else 1.0),
         ("found one by if, and, or", lambda k, _: max(k[0], 0.5)),
         ("found float", lambda k, _: math.sqrt(1 + k[0] * k[0])),
+        ("found float", lambda k, _: int(k[0]) + 1.0),
         ("found less_equal", lambda k, r: np.where(r <= 0.1, 1.0, 1 + k[0] * r)),
         ("found multiply with out", lambda k, r: np.multiply(k[0], r, out=r if isinstance(r, np.ndarray) else (r,))),
     ],

@@ -126,6 +126,8 @@ class Number(np.lib.mixins.NDArrayOperatorsMixin):
     def __float__(self) -> float:
         raise InputError("lens formula: expected functions of NumPy, found float or one of Python's math.")
 
+    __int__ = __round__ = __trunc__ = __float__
+
 
 def _aligned(notes: Notes, operands: Sequence) -> list[Number]:
     """All as numbers with as many slopes."""
