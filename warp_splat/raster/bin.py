@@ -67,7 +67,7 @@ def bin_by_counting(
     check_count(total, camera, count, splats2d.radii.device)
     _check_longest(int(np.diff(ends, prepend=0).max(initial=0)))
     instances, places = (torch.empty(total, dtype=torch.int32, device="cpu") for _ in range(2))
-    inputs = [*(in_place(table) for table in (order, _taken(begins, order), row_ends)), spans]
+    inputs = [*(in_place(table) for table in (order, begins, row_ends)), spans]
     _launch_bands(lists.scatter, bands, inputs, [in_place(cursor), view(instances, wp.int32), view(places, wp.int32)])
     ranges = torch.from_numpy(np.stack([np.concatenate([[0], ends[:-1]]), ends], 1).astype(np.int32))
     found = (instances, places, torch.from_numpy(begins), ranges, balanced_slices(ends))

@@ -162,8 +162,8 @@ def scatter(
     first: int,
     bounds: wp.array[int],  # [B + 1] of the bands in `order`
     order: wp.array[int],  # [V] splat, nearest first
-    begins: wp.array[int],  # [V] where the places of each begin, in that order
-    row_ends: wp.array[wp.int64],  # [V] likewise
+    begins: wp.array[int],  # [V] where the places of each splat begin
+    row_ends: wp.array[wp.int64],  # [V] where the rows of tiles end, in the order
     spans: wp.array[wp.vec2i],  # [R]
     # out
     cursor_out: wp.array2d[int],  # [B, T] where a band's next instance of a tile goes
@@ -175,8 +175,8 @@ def scatter(
     if bounds[band] > 0:
         row = int(row_ends[bounds[band] - 1])
     for rank in range(bounds[band], bounds[band + 1]):
-        ask(places_out, begins[wp.min(rank + AHEAD, begins.shape[0] - 1)])
-        number = begins[rank]
+        ask(places_out, begins[order[wp.min(rank + AHEAD, order.shape[0] - 1)]])
+        number = begins[order[rank]]
         end = int(row_ends[rank])
         while row < end:
             span = spans[row]
