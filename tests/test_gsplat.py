@@ -104,6 +104,16 @@ def test_harmonics(degree):
     assert torch.allclose(found, expected, atol=1e-12)
 
 
+@pytest.mark.parametrize(
+    ("degree", "of_rays", "shape"), [(1, 5, (5, 3, 3)), (0, 5, (1, 4, 3)), (-2, 5, (5, 4, 3)), (1.0, 5, (5, 4, 3))]
+)
+def test_harmonics_that_do_not_fit(degree, of_rays, shape):
+    refusal(
+        lambda: warp_splat.gsplat.spherical_harmonics(degree, torch.ones(of_rays, 3), torch.ones(shape)),
+        match="expected a degree",
+    )
+
+
 @pytest.mark.parametrize("triu", [False, True])
 def test_covariances_and_their_inverses(triu):
     quats, scales = torch.randn(50, 4).double(), torch.randn(50, 3).double()

@@ -106,6 +106,8 @@ def test_photographs_keep_their_lens(photos, scene, tmp_path, capsys, why):
         pixels = read_pixels(path, 0.0).color
         pixels = np.dstack([pixels, pixels[..., :1] > 0.5]) if why == "alpha" else pixels
         write_image(root / path.name, (65535 * pixels**1.5).astype(np.uint16), linear)
+    write_image(tmp_path / "opaque.png", texture(channels=4) | np.uint8(255))
+    assert not stages._is_more_than_bytes(tmp_path / "opaque.png")
     config = SfmConfig(str(root), str(tmp_path), keep_lens=why == "asked")
     stages.write_scene(scene / "sfm" / "models" / "0", root, tmp_path, tmp_path / "part", COUNT, config)
     assert ("few" if why == "asked" else "photo_0.png, photo_1.png") in capsys.readouterr().out + "few"
@@ -387,11 +389,8 @@ def test_a_video_that_cannot_be_decoded_gets_one_sentence(tmp_path, keep, words)
 @pytest.mark.slow
 def test_png_files_can_be_written_after_pycolmap_was_loaded(tmp_path):
     """The libraries in pycolmap's wheel clash with those in OpenImageIO's if they are loaded first."""
-    code = (
-        "import sys, warp_splat.scene.colmap, numpy as np; from warp_splat.formats.png import save_png; "
-        "save_png(sys.argv[1], np.zeros((8, 8, 3), np.uint8))"
-    )
-    python("-c", code, tmp_path / "a.png")
+    code = "import sys, warp_splat.scene.colmap_library, numpy, OpenImageIO as oiio; picture = numpy.zeros((8, 8, 3)); "
+    python("-c", code + "assert oiio.ImageBuf(picture).write(sys.argv[1], 'uint8')", tmp_path / "a.png")
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no such signals")

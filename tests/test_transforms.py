@@ -63,6 +63,12 @@ def test_transforms_sizes_twice_those_of_the_files(tmp_path):
     assert (camera.width, camera.fx, camera.fy, camera.cx, camera.cy) == (WIDTH, 20, 22, 11.25, 8.625)
 
 
+def test_transforms_with_a_byte_order_mark(tmp_path):
+    path = write_transforms(tmp_path) / "transforms.json"
+    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
+    assert len(load(tmp_path)[0].train) == 2
+
+
 def test_transforms_with_lists_of_names(tmp_path):
     names = [f"images/{name}.png" for name in "abcde"]
     root = write_transforms(tmp_path, names, train_filenames=[names[3], f"./{names[0]}"], val_filenames=[names[1]])
@@ -105,6 +111,7 @@ FEW = {"camera_model": "OPENCV_FISHEYE", "k1": 0.02, "k2": -0.01, "k3": 0.003}
     ("values", "lens"),
     [
         ({"k1": -0.15, "k2": 0.04, "p1": 0.002, "p2": -0.003}, Lens("OPENCV", (-0.15, 0.04, 0.002, -0.003))),
+        ({"distortion_params": [-0.15, 0.04, 0, 0, 0.002, -0.003]}, Lens("OPENCV", (-0.15, 0.04, 0.002, -0.003))),
         (FEW, Lens("OPENCV_FISHEYE", (0.02, -0.01, 0.003, 0))),
         ({"camera_model": "EQUIRECTANGULAR", "w": 64, "h": 32}, Lens("EQUIRECTANGULAR")),
     ],
@@ -157,6 +164,7 @@ def text(content):
 
 BAD = {
     "k4": (broken(k1=0.1, k4=0.1), ["frame 0", "OPENCV", "k4 = 0.1"]),
+    "params": (broken(distortion_params=[0.1]), ["frame 0", "as a list of k1, k2, k3, k4, p1, p2, got [0.1]"]),
     "fisheye-p1": (broken(camera_model="OPENCV_FISHEYE", p1=0.1), ["frame 0", "p1 = 0.1"]),
     "model": (broken(camera_model="EQUIRECTANGULAR"), ["frame 0", "EQUIRECTANGULAR"]),
     "fisheye-text": (broken(is_fisheye="true"), ["frame 0: expected is_fisheye as true or false, got 'true'"]),

@@ -3,6 +3,7 @@
 import torch
 
 from warp_splat.color import harmonics_at
+from warp_splat.errors import InputError
 from warp_splat.gsplat.sigma_points import rows_turned
 from warp_splat.raster.beside import rotations
 
@@ -63,7 +64,14 @@ def spherical_harmonics(
         dirs: directions [..., 3], of any length.
         coeffs: [..., K, 3].
         masks: where to compute [...]; elsewhere the result is 0.
+
+    Raises:
+        InputError: if these shapes or the degree do not fit together.
     """
+    known = isinstance(degrees_to_use, int) and degrees_to_use >= 0
+    if not known or (degrees_to_use + 1) ** 2 > coeffs.shape[-2] or dirs.shape[:-1] != coeffs.shape[:-2]:
+        found = f"{degrees_to_use!r}, {list(dirs.shape)}, {list(coeffs.shape)}"
+        raise InputError(f"expected a degree D from 0, dirs [..., 3], coeffs [..., (D + 1)^2 or more, 3], got {found}.")
     x, y, z = torch.nn.functional.normalize(dirs, dim=-1).unbind(-1)
     basis = torch.stack(harmonics_at(x, y, z, degrees_to_use), -1)
     sums = (basis[..., None] * coeffs[..., : basis.shape[-1], :]).sum(-2)

@@ -75,7 +75,7 @@ def colors_of(request: Request, seen: Seen) -> torch.Tensor:
     if request.viewmats_rs is not None:
         centers = 0.5 * (centers + torch.linalg.inv(request.viewmats_rs)[..., :3, 3])
     rays = request.means[:, None] - centers[:, :, None]
-    colors = spherical_harmonics(request.sh_degree, rays, request.colors) + 0.5
+    colors = spherical_harmonics(request.sh_degree, rays, request.colors.expand(*rays.shape[:-1], -1, 3)) + 0.5
     return torch.where(seen.drawn[..., None], colors.clamp_min(0.0), 0.0)
 
 

@@ -64,8 +64,8 @@ class Blend(torch.autograd.Function):
         pixels, saved = blending.driver.blend(blending.bins, blending.camera, background, options, keep)
         blending.saved = saved._replace(kept=background.new_empty(0))
         ctx.save_for_backward(background, *saved)
-        ctx.shapes = [tensor.shape for tensor in pixels]
         ctx.set_materialize_grads(False)  # but one zero for all, where none comes
+        ctx.nothing = [background.new_zeros(()).expand(tensor.shape) for tensor in pixels]
         return tuple(pixels)
 
     @staticmethod
@@ -73,11 +73,8 @@ class Blend(torch.autograd.Function):
     def backward(ctx, *adj_pixels):
         with stage("adjoint of blend"):
             (background, *saved), it = ctx.saved_tensors, ctx.blending
-            nothing = background.new_zeros(())
-            given = zip(adj_pixels, ctx.shapes, strict=True)
-            adj_pixels = Pixels(
-                *(nothing.expand(shape) if adj is None else adj.contiguous().resolve_neg() for adj, shape in given)
-            )
+            given = zip(adj_pixels, ctx.nothing, strict=True)
+            adj_pixels = Pixels(*(zero if adj is None else adj.contiguous().resolve_neg() for adj, zero in given))
             slots, adj_background, dropped = it.driver.adjoint(
                 it.adjoint, it.bins, it.options, background, Saved(*saved), adj_pixels
             )

@@ -195,8 +195,7 @@ def _in_turn(passes: Sequence[Pass], count: int, lanes: int, device: torch.devic
         for each in passes:
             each(low, high)
 
-    groups = -(-count // lanes)
-    in_slices(run, [0, groups] if device.type == "cuda" else even_slices(groups, each=lanes))
+    in_slices(run, even_slices(-(-count // lanes), each=lanes, device=device))
 
 
 class Project(torch.autograd.Function):

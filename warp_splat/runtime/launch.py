@@ -225,8 +225,7 @@ def launch_in_lanes(
             bound(1, slice(whole, count), slice(most, None))(max(low - most, 0), high - most)
 
     in_groups = bound(lanes, slice(0, whole), slice(0, most))
-    cuda = torch.device(device).type == "cuda"
-    in_slices(run_slice, [0, most + left] if cuda else even_slices(most + left, each=lanes * run))
+    in_slices(run_slice, even_slices(most + left, each=lanes * run, device=device))
     return found
 
 

@@ -30,6 +30,7 @@ PERSPECTIVE = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV",
 FISHEYE, PANORAMA = "OPENCV_FISHEYE", "EQUIRECTANGULAR"
 UNKNOWN = ("latlong", "ftheta_p0")  # lenses of instant-ngp
 FOCAL = ("fl_x", "camera_angle_x", "fl_y", "camera_angle_y")
+DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")  # in the order of nerfstudio's distortion_params
 
 
 def read_transforms(
@@ -66,7 +67,7 @@ def _parse(path: Path) -> dict[str, Any]:
             raise InputError(f"{path}: expected at most {JSON_BYTES} bytes of JSON, found {size}; leave out frames.")
         kinds = (ValueError, RecursionError)  # of the syntax, of the encoding, or of the depth
         with refusing(kinds, f"{path}: expected JSON, but it cannot be parsed", "; correct it."):
-            content = json.loads(path.read_text(encoding="utf-8"))
+            content = json.loads(path.read_text(encoding="utf-8-sig"))
     if not isinstance(content, dict):
         raise InputError(f"{path}: expected a JSON object with the key frames, found another value; correct the file.")
     return content
@@ -152,6 +153,10 @@ def _lens(values: dict[str, Any], size: tuple[int, int], where: str) -> Calibrat
             raise _wrong(where, f"{key} as a number between -{LARGEST:g} and {LARGEST:g}", value)
         return float(value)
 
+    if (listed := values.get("distortion_params")) is not None:
+        if not isinstance(listed, list) or len(listed) != len(DISTORTION):
+            raise _wrong(where, f"distortion_params as a list of {', '.join(DISTORTION)}", listed)
+        values = {**values, **dict(zip(DISTORTION, listed, strict=True))}
     if other := [key for key in UNKNOWN if values.get(key) is not None and values[key] is not False]:
         raise _wrong(where, f"a lens without {other[0]}", values[other[0]])
     width, height = number("w", size[0]), number("h", size[1])
@@ -172,7 +177,7 @@ def _lens(values: dict[str, Any], size: tuple[int, int], where: str) -> Calibrat
     fx = focal_of("x", width)
     fy = focal_of("y", height) if "fl_y" in values or ("fl_x" not in values and "camera_angle_y" in values) else fx
     focal = (fx, fy, number("cx", width / 2), number("cy", height / 2))
-    k1, k2, k3, k4, p1, p2 = (number(key) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
+    k1, k2, k3, k4, p1, p2 = (number(key) for key in DISTORTION)
     if (fisheye := values.get("is_fisheye") or False) not in (True, False):
         raise _wrong(where, "is_fisheye as true or false", fisheye)
     model = values.get("camera_model", FISHEYE if fisheye else "OPENCV")

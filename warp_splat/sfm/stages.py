@@ -21,7 +21,7 @@ from warp_splat.config import SfmConfig
 from warp_splat.errors import InputError
 from warp_splat.runtime.interrupts import interruptible, leave
 from warp_splat.scene.colmap_library import pycolmap
-from warp_splat.scene.images import read_kind
+from warp_splat.scene.images import read_kind, read_pixels
 from warp_splat.text import few
 
 LENS = "OPENCV"  # fx, fy, cx, cy, two radial and two tangential coefficients: what phones and cameras need
@@ -114,12 +114,9 @@ def write_scene(model: Path, root: Path, scene: Path, part: Path, count: int, co
     shutil.rmtree(scene / "images", ignore_errors=True)  # of a run that was stopped before sparse/ got its name
     undistort = partial(pycolmap.undistort_images, num_threads=config.threads)
     names = sorted(image.name for image in pycolmap.Reconstruction(str(model)).images.values())
-    lost = [name for name in names if any(read_kind(root / name))]  # pycolmap knows bytes of three channels
-    if lost and not (config.keep_lens or config.quiet):
-        tqdm.write(
-            f"Photographs stay as they are, with their lens: {few(lost)} may have linear light or alpha, which "
-            "undistortion would lose; training undistorts them as it loads them."
-        )
+    lost = [] if config.keep_lens else [name for name in names if _is_more_than_bytes(root / name)]
+    if lost and not config.quiet:
+        tqdm.write(f"All photographs keep their lens: undistortion would lose linear light or alpha of {few(lost)}.")
     title, write = ("copies", _copy) if config.keep_lens or lost else ("undistortion", undistort)
 
     def written() -> int:
@@ -132,6 +129,12 @@ def write_scene(model: Path, root: Path, scene: Path, part: Path, count: int, co
     os.renames(part / "sparse", part / "model" / "0")
     os.replace(part / "model", scene / "sparse")  # the last step: where sparse/ is, all is
     shutil.rmtree(part, ignore_errors=True)
+
+
+def _is_more_than_bytes(path: Path) -> bool:
+    """Whether a photograph is in linear light, or something of it is transparent: pycolmap knows bytes of colors."""
+    linear, alpha = read_kind(path)
+    return linear or (alpha and read_pixels(path, 0.0).alpha is not None)
 
 
 def _copy(part: Path, model: Path, root: Path, cancellation_token: object) -> None:
