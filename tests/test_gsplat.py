@@ -102,10 +102,14 @@ def test_harmonics(degree):
     found = warp_splat.gsplat.spherical_harmonics(degree, rays, coefficients, rays[:, 0] > 0)
     expected = theirs._spherical_harmonics(degree, rays, coefficients) * (rays[:, :1] > 0)
     assert torch.allclose(found, expected, atol=1e-12)
+    assert torch.equal(
+        found, warp_splat.gsplat.spherical_harmonics(np.uint8(degree), rays, coefficients, rays[:, 0] > 0)
+    )
 
 
 @pytest.mark.parametrize(
-    ("degree", "of_rays", "shape"), [(1, 5, (5, 3, 3)), (0, 5, (1, 4, 3)), (-2, 5, (5, 4, 3)), (1.0, 5, (5, 4, 3))]
+    ("degree", "of_rays", "shape"),
+    [(1, 5, (5, 3, 3)), (0, 5, (1, 4, 3)), (-2, 5, (5, 4, 3)), (1.5, 5, (5, 4, 3)), (1, 5, (5, 4, 2)), (0, 5, (3,))],
 )
 def test_harmonics_that_do_not_fit(degree, of_rays, shape):
     refusal(

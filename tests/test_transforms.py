@@ -69,6 +69,14 @@ def test_transforms_with_a_byte_order_mark(tmp_path):
     assert len(load(tmp_path)[0].train) == 2
 
 
+def test_a_frame_has_its_own_distortion(tmp_path):
+    shared = [-0.1, 0.02, 0, 0, 0.001, -0.002]
+    of_frame = lambda index: {"k1": 0.05, "k2": 0, "p1": 0, "p2": 0} if index else {}  # noqa: E731
+    views = load(write_transforms(tmp_path, frame=of_frame, distortion_params=shared), lens="native")[0].train
+    lenses = [view.camera.lens for view in views]
+    assert lenses == [Lens("OPENCV", (-0.1, 0.02, 0.001, -0.002)), Lens("OPENCV", (0.05, 0, 0, 0))]
+
+
 def test_transforms_with_lists_of_names(tmp_path):
     names = [f"images/{name}.png" for name in "abcde"]
     root = write_transforms(tmp_path, names, train_filenames=[names[3], f"./{names[0]}"], val_filenames=[names[1]])

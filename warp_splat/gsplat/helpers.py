@@ -1,5 +1,7 @@
 """What gsplat's strategies call beside its ``rasterization``, in torch, with its names and arguments."""
 
+import math
+
 import torch
 
 from warp_splat.color import harmonics_at
@@ -68,11 +70,11 @@ def spherical_harmonics(
     Raises:
         InputError: if these shapes or the degree do not fit together.
     """
-    known = isinstance(degrees_to_use, int) and degrees_to_use >= 0
-    if not known or (degrees_to_use + 1) ** 2 > coeffs.shape[-2] or dirs.shape[:-1] != coeffs.shape[:-2]:
+    fits = coeffs.dim() > 1 and (*dirs.shape, 3) == (*coeffs.shape[:-2], 3, coeffs.shape[-1])
+    if not fits or degrees_to_use not in range(math.isqrt(coeffs.shape[-2])):
         found = f"{degrees_to_use!r}, {list(dirs.shape)}, {list(coeffs.shape)}"
         raise InputError(f"expected a degree D from 0, dirs [..., 3], coeffs [..., (D + 1)^2 or more, 3], got {found}.")
     x, y, z = torch.nn.functional.normalize(dirs, dim=-1).unbind(-1)
-    basis = torch.stack(harmonics_at(x, y, z, degrees_to_use), -1)
+    basis = torch.stack(harmonics_at(x, y, z, int(degrees_to_use)), -1)
     sums = (basis[..., None] * coeffs[..., : basis.shape[-1], :]).sum(-2)
     return sums if masks is None else torch.where(masks[..., None], sums, 0.0)

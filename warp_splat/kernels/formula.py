@@ -123,7 +123,7 @@ class Number(np.lib.mixins.NDArrayOperatorsMixin):
     def __bool__(self) -> bool:
         raise InputError("lens formula: expected choices by np.where, found one by if, and, or, not, min or max.")
 
-    def __float__(self) -> float:
+    def __float__(self, *_digits) -> float:
         raise InputError("lens formula: expected functions of NumPy, found float or one of Python's math.")
 
     __int__ = __round__ = __trunc__ = __float__
