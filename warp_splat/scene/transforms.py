@@ -97,11 +97,12 @@ def _read_photos(path: Path, content: dict[str, Any], report: Report, native: bo
 def _over(content: dict[str, Any], frame: dict[str, Any]) -> dict[str, Any]:
     """The file's values, and a frame's over them; its own focal length or angle replaces those, of y that of y.
 
-    So do its coefficients of distortion, also where the file has a list of them.
+    A list of coefficients of distortion becomes numbers of their own, so that a frame's replace the file's, too.
     """
     own, shared = ({key: value for key, value in one.items() if value is not None} for one in (frame, content))
-    if isinstance(listed := shared.get("distortion_params"), list) and len(listed) == len(DISTORTION):
-        shared |= dict(zip(DISTORTION, shared.pop("distortion_params"), strict=True))
+    for values in (own, shared):
+        if isinstance(listed := values.get("distortion_params"), list) and len(listed) == len(DISTORTION):
+            values |= dict(zip(DISTORTION, values.pop("distortion_params"), strict=True))
     first = next((place for place, key in enumerate(FOCAL[:3]) if key in own), len(FOCAL))
     return {key: value for key, value in shared.items() if key not in FOCAL[first // 2 * 2 :]} | own
 
@@ -165,10 +166,8 @@ def _lens(values: dict[str, Any], size: tuple[int, int], where: str) -> Calibrat
         raise InputError(f"{where}: expected w and h as numbers of pixels, got {width} and {height}; correct the file.")
     if values.get("camera_model") == PANORAMA:
         return Calibration(PANORAMA, int(width), int(height), (width, height))
-    if (listed := values.get("distortion_params")) is not None:
-        if not isinstance(listed, list) or len(listed) != len(DISTORTION):
-            raise _wrong(where, f"distortion_params as a list of {', '.join(DISTORTION)}", listed)
-        values = {**values, **dict(zip(DISTORTION, listed, strict=True))}
+    if (listed := values.get("distortion_params")) is not None:  # else it has become numbers of their own
+        raise _wrong(where, f"distortion_params as a list of {', '.join(DISTORTION)}", listed)
 
     def focal_of(axis: str, side: float) -> float:
         known, key = f"fl_{axis}", f"camera_angle_{axis}"
