@@ -118,6 +118,11 @@ def test_harmonics_that_do_not_fit(degree, of_rays, shape):
     )
 
 
+def test_masks_of_harmonics_are_those_of_the_directions():
+    rays, coefficients, mask = torch.ones(3, 3, 3), torch.ones(3, 3, 1, 3), torch.tensor([True, False, False])
+    refusal(lambda: warp_splat.gsplat.spherical_harmonics(0, rays, coefficients, mask), match=r"\(3,\)\]")
+
+
 @pytest.mark.parametrize("triu", [False, True])
 def test_covariances_and_their_inverses(triu):
     quats, scales = torch.randn(50, 4).double(), torch.randn(50, 3).double()

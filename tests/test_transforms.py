@@ -172,6 +172,7 @@ def text(content):
 
 BAD = {
     "k4": (broken(k1=0.1, k4=0.1), ["frame 0", "OPENCV", "k4 = 0.1"]),
+    "fisheye-opencv": (broken(camera_model="OPENCV", is_fisheye=True), ["frame 0", "'OPENCV', is_fisheye True"]),
     "params": (broken(distortion_params=[0.1]), ["frame 0", "as a list of k1, k2, k3, k4, p1, p2, got [0.1]"]),
     "fisheye-p1": (broken(camera_model="OPENCV_FISHEYE", p1=0.1), ["frame 0", "p1 = 0.1"]),
     "model": (broken(camera_model="EQUIRECTANGULAR"), ["frame 0", "EQUIRECTANGULAR"]),

@@ -70,10 +70,11 @@ def spherical_harmonics(
     Raises:
         InputError: if these shapes or the degree do not fit together.
     """
+    found = [None if tensor is None else tuple(tensor.shape) for tensor in (dirs, coeffs, masks)]
     fits = coeffs.dim() > 1 and (*dirs.shape, 3) == (*coeffs.shape[:-2], 3, coeffs.shape[-1])
-    if not fits or degrees_to_use not in range(math.isqrt(coeffs.shape[-2])):
-        found = f"{degrees_to_use!r}, {list(dirs.shape)}, {list(coeffs.shape)}"
-        raise InputError(f"expected a degree D from 0, dirs [..., 3], coeffs [..., (D + 1)^2 or more, 3], got {found}.")
+    if not fits or found[2] not in (None, dirs.shape[:-1]) or degrees_to_use not in range(math.isqrt(coeffs.shape[-2])):
+        wanted = "a degree D from 0, dirs [..., 3], coeffs [..., (D + 1)^2 or more, 3] and masks [...]"
+        raise InputError(f"spherical_harmonics: expected {wanted}, got {degrees_to_use!r} and {found}.")
     x, y, z = torch.nn.functional.normalize(dirs, dim=-1).unbind(-1)
     basis = torch.stack(harmonics_at(x, y, z, int(degrees_to_use)), -1)
     sums = (basis[..., None] * coeffs[..., : basis.shape[-1], :]).sum(-2)

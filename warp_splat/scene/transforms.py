@@ -187,14 +187,14 @@ def _lens(values: dict[str, Any], size: tuple[int, int], where: str) -> Calibrat
     model = values.get("camera_model", FISHEYE if fisheye else "OPENCV")
     if model == FISHEYE and not (p1 or p2):
         params = (*focal, k1, k2, k3, k4)
-    elif model in PERSPECTIVE and not k4:
+    elif model in PERSPECTIVE and not (k4 or fisheye):
         model = "FULL_OPENCV" if k3 else "OPENCV" if k1 or k2 or p1 or p2 else "PINHOLE"
         bent = (*focal, k1, k2, p1, p2)
         params = {"PINHOLE": focal, "OPENCV": bent}.get(model, (*bent, k3, 0, 0, 0))
     else:
         raise InputError(
-            f"{where}: expected camera_model OPENCV with k1, k2, k3, p1, p2, {FISHEYE} with k1 to k4 or {PANORAMA}, "
-            f"got {reprlib.repr(model)} with k4 = {k4}, p1 = {p1}, p2 = {p2}; undistort the photographs first."
+            f"{where}: expected camera_model OPENCV with k1, k2, k3, p1, p2, {FISHEYE} with k1 to k4, {PANORAMA}, got "
+            f"{reprlib.repr(model)}, is_fisheye {fisheye}, k4 = {k4}, p1 = {p1}, p2 = {p2}; undistort the photographs."
         )
     return Calibration(model, int(width), int(height), params)
 
