@@ -5,6 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+import torch
 from hostile import refusal
 from scipy.spatial.transform import Rotation
 
@@ -77,6 +78,8 @@ def test_camera_copies_what_it_is_given():
         ("rotation", 2 * np.eye(3)),
         ("translation", (0.0, 0.0)),
         ("translation", (0.0, np.inf, 0.0)),
+        ("fx", torch.tensor(50.0, requires_grad=True)),  # it would get no gradient
+        ("rotation", torch.eye(3, requires_grad=True)),
     ],
 )
 def test_bad_value_is_named(field, value):

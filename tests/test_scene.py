@@ -8,6 +8,7 @@ import pycolmap
 import pytest
 import scene_files
 from commands import FOX, python
+from hostile import refusal
 from scene_files import HEIGHT, POINTS, WIDTH, distorted_picture, load, texture, thin_prism, write_blender, write_colmap
 
 from warp_splat import Camera, InputError
@@ -296,6 +297,12 @@ def test_blender_splits(tmp_path):
     assert [view.name for view in scene.train] == [*names[0], *names[1]] and not scene.test
     scene, _ = load(root, eval=True)
     assert [[view.name for view in views] for views in (scene.train, scene.test)] == names
+
+
+def test_blender_with_training_photographs_in_its_test_file(tmp_path):
+    root = write_blender(tmp_path, train=3, test=2)
+    (root / "transforms_test.json").write_bytes((root / "transforms_train.json").read_bytes())
+    refusal(lambda: load(root, eval=True), "photographs that do not train", "3 in both lists", "r_0.png", "--eval")
 
 
 def test_blender_without_test_file(tmp_path):
