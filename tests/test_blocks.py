@@ -121,6 +121,7 @@ WRONG = {
     "expected the number of blocks of": spoil('"cells": [', '"cells": [[[0, 0, 0], [1, 1, 1]], '),
     "expected the cells of": spoil("3.4", "3.1"),
     "expected the antialiasing of": spoil("antialiasing=False", "antialiasing=True", "cfg_args"),
+    "expected the linear_light of": spoil("linear_light=False", "linear_light=True", "cfg_args"),
     "expected the sh_degree of": spoil("sh_degree=3", "sh_degree=2", "cfg_args"),
     "expected the eval of": spoil("eval=True", "eval=False", "cfg_args"),
     "expected the origin of": lambda folder: write_coordinates(folder / "1", {"origin": [1.0, 2.0, 3.0]}),

@@ -356,5 +356,5 @@ def test_training_shows_what_it_compares(options, scene, tmp_path):
     view, (part,) = scene.train[3], trainer.parts
     image, exposures = trainer.look(view.camera).image, trainer.exposures
     expected = part.image(image, None, SimpleNamespace(view=view)).detach()
-    assert torch.equal(as_photographed(image, exposures, view.name), expected)
-    assert as_photographed(image, exposures, "another") is image
+    assert torch.equal(as_photographed(exposures, image, view.name), expected)
+    assert as_photographed(exposures, image, "another") is image

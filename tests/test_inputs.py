@@ -7,6 +7,7 @@ import OpenImageIO as oiio
 import pytest
 import scene_files
 import torch
+from commands import SHORT
 from hostile import refusal
 from PIL import Image
 from scene_files import HEIGHT, WIDTH, load, texture, write_colmap, write_floats, write_image, write_transforms
@@ -16,7 +17,7 @@ from warp_splat.errors import InputError
 from warp_splat.formats.exchange import save_gaussians
 from warp_splat.formats.model_folder import ply_path
 from warp_splat.scene import load_scene
-from warp_splat.scene.images import read_kind, read_mask, read_pixels
+from warp_splat.scene.images import read_kind, read_mask, read_numbers, read_pixels
 from warp_splat.training.loss import image_loss
 from warp_splat.training.options import TrainConfig
 from warp_splat.training.trainer import Trainer
@@ -160,6 +161,18 @@ def test_floats_are_linear_light(tmp_path, monkeypatch):
     assert loss.isfinite() and all(tensor.isfinite().all() for tensor in trainer.model.parameters.values())
 
 
+def test_photographs_that_have_become_linear(tmp_path, ran, fails):
+    """A training does not go on with them, and what it made is no start without a word."""
+    root, model = write_colmap(tmp_path / "scene"), tmp_path / "model"
+    ran("train", "-s", root, "-m", model, *SHORT, "--iterations", "2")
+    for photo in (root / "images").iterdir():
+        write_floats(photo.with_suffix(".exr"), light())
+        photo.unlink()
+    assert "expected photographs not in linear light, as" in fails("train", "--resume", model, "--iterations", "4")
+    begun = ran("train", "-s", root, "-m", tmp_path / "new", "--start_ply", model, "--iterations", "1")
+    assert f"If {model} is not, its colors start too bright" in begun
+
+
 def write_exr(path, channels, size=(WIDTH, HEIGHT)):
     """An EXR of so many pixels, whose picture has those of the others; a channel is 1/8, 2/8, ..., or no number."""
     spec, file = oiio.ImageSpec(*size, len(channels), oiio.FLOAT), oiio.ImageOutput.create("a.exr")
@@ -167,6 +180,12 @@ def write_exr(path, channels, size=(WIDTH, HEIGHT)):
     values = [{"Z": 1e30, "A": 1.0, "cut.A": 0.5}.get(name, (1 + place) / 8) for place, name in enumerate(channels)]
     pixels = np.tile(np.float32(values), (size[1], size[0], 1))
     assert file.open(str(path), spec) and file.write_image(pixels) and file.close()
+
+
+@pytest.mark.parametrize(("channels", "found"), [("A Z", 1e30), ("B G R Z", 1e30), ("Y", 0.125), ("V A", 0.125)])
+def test_numbers_of_an_exr_are_those_of_z(tmp_path, channels, found):
+    write_exr(tmp_path / "a.exr", channels.split())
+    assert (read_numbers(tmp_path / "a.exr") == np.float32(found)).all()
 
 
 @pytest.mark.parametrize(

@@ -239,7 +239,7 @@ def test_colors_are_those_of_photographs_in_the_mean_exposure():
     turn = np.eye(3) * 0.8 + 0.05
     numbers = np.float32([*(turn - np.eye(3)), [0.1] * 3]).ravel()
     exposures = Exposures("affine", 0.0, np.zeros(2, np.float32), {"a": numbers})
-    exposed = as_photographed(torch.from_numpy(image), exposures, "a").numpy()
+    exposed = as_photographed(exposures, torch.from_numpy(image), "a").numpy()
     taken = np.rint(255 * exposed.repeat(3, 0).repeat(3, 1)).astype(np.uint8)
     taken[:, 12:] += 20
     mask = np.ones(taken.shape[:2], np.uint8)

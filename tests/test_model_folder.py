@@ -4,6 +4,7 @@ import argparse
 import json
 import subprocess
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from warp_splat.formats import model_folder
 from warp_splat.formats.coordinates import write_coordinates
 from warp_splat.formats.exchange import load_gaussians, save_gaussians
 from warp_splat.formats.splats import SplatFile
+from warp_splat.rendering.finished import Finished
 from warp_splat.scene.start import load_start
 from warp_splat.scene.types import Decoded, View
 
@@ -201,6 +203,15 @@ def test_default_model_path_is_new_each_time():
     assert first.parent == Path("output") and len(first.name) == 10
 
 
+def test_the_light_of_a_model_is_what_its_training_says(tmp_path):
+    """Else that of the photographs."""
+    save_gaussians(model_folder.ply_path(tmp_path, 3), SplatFile(some_splats(3)))
+    scene = SimpleNamespace(linear=True)
+    assert Finished(tmp_path).is_linear(scene) and not Finished(tmp_path).is_linear(None)
+    model_folder.write_cfg_args(tmp_path, {"linear_light": False})
+    assert not Finished(tmp_path).is_linear(scene)
+
+
 @pytest.mark.parametrize("mark", [False, True])
 def test_open_model(tmp_path, mark, monkeypatch, fails, ran):
     """cfg_args goes before the file's own mark of antialiasing, which goes before nothing; convert does likewise."""
@@ -208,7 +219,7 @@ def test_open_model(tmp_path, mark, monkeypatch, fails, ran):
     for iteration in (3, 20):
         save_gaussians(model_folder.ply_path(folder, iteration), SplatFile(some_splats(iteration), mark))
     iteration, file, options = model_folder.open_model(folder)
-    told = {"antialiasing": mark, "linear_light": False}
+    told = {"antialiasing": mark, "linear_light": None}
     assert (iteration, len(file.splats.means), options) == (20, 20, {"eval": True, **told})
     assert model_folder.open_model(model_folder.ply_path(folder, 3))[::2] == (0, options)
     ran("convert", folder, target)

@@ -184,6 +184,10 @@ def scaled(scale):
         (in_fits(lambda fits: fits.pop("view_009")), "depth_params.json: expected JSON of the kind"),
         (scaled(None), "found {'scale': None, 'offset': 0} for view_009"),
         (scaled(10**400), "depth_params.json: the file is damaged"),
+        (
+            in_fits(lambda fits: [fit.update(scale=1e300) for fit in fits.values()]),
+            "--depths depths: expected maps of 1 / depth, found scales or numbers below 0; fit them.",
+        ),
     ],
 )
 def test_what_does_not_fit_is_one_sentence(damage, sentence, mapped):

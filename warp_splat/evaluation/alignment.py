@@ -7,6 +7,7 @@ import torch
 from torch.nn.functional import avg_pool2d
 
 from warp_splat.camera import Camera
+from warp_splat.color import to_srgb
 from warp_splat.config import RasterOptions
 from warp_splat.raster.api import render
 from warp_splat.raster.camera_parameters import CameraParameters
@@ -19,29 +20,38 @@ STEPS = 40  # pictures and their adjoints, about: an iteration that has begun is
 
 
 def where_taken(
-    gaussians: Gaussians, background: torch.Tensor, options: RasterOptions, extent: float
+    gaussians: Gaussians,
+    background: torch.Tensor,
+    options: RasterOptions,
+    extent: float,
+    finish: Callable[[torch.Tensor, str], torch.Tensor],
 ) -> Callable[[View], Camera]:
-    """A function from a view to the camera that :func:`find_pose` finds for it."""
+    """A function from a view to the camera that :func:`find_pose` finds for it.
+
+    ``finish``: an image as the photograph of a name shows it.
+    """
     gaussians = Gaussians(*(tensor.detach() for tensor in gaussians))
-    return lambda view: find_pose(lambda camera: render(gaussians, camera, background, options).image, view, extent)
+    draw = lambda camera, name: finish(render(gaussians, camera, background, options).image, name)  # noqa: E731
+    return lambda view: find_pose(lambda camera: draw(camera, view.name), view, extent)
 
 
 def find_pose(draw: Callable[[CameraParameters], torch.Tensor], view: View, extent: float) -> Camera:
-    """The camera from which the model looks most like the photograph, by L-BFGS near where it was given.
+    """The camera from which the model looks most like the photograph, on a screen, by L-BFGS near where it was given.
 
     Args:
-        draw: the model's image [H, W, 3] through a camera, with gradients for that.
+        draw: the image [H, W, 3] as the photograph shows it, through a camera, with gradients for that.
         view: the photograph; where it has a mask, the rest does not count.
         extent: size of the scene, world units.
     """
     camera = view.camera
     units = torch.tensor([1.0] * 3 + [extent] * 3, dtype=torch.float64)
-    photo = torch.from_numpy(np.float32(view.image / 255.0) if view.image.dtype == np.uint8 else view.image)
+    photo = torch.from_numpy(np.float32(view.picture / 255.0))
     mask = torch.ones(1) if view.mask is None else torch.from_numpy(view.mask[..., None]).float()
 
     def loss(numbers: np.ndarray) -> tuple[float, np.ndarray]:
         twist = torch.from_numpy(numbers).requires_grad_()
         image = draw(CameraParameters(camera, twist * units))
+        image = to_srgb(image.clamp(0.0, 1.0), torch.where) if view.linear else image
         difference = ((image - photo.to(image.device)) * mask.to(image.device)).permute(2, 0, 1)
         levels = [level for level in LEVELS if level <= min(difference.shape[1:])]
         errors = torch.stack([avg_pool2d(difference, level).square().mean() for level in levels]).sum()

@@ -174,7 +174,7 @@ def open_model(
     options = read_cfg_args(args.parent) if args.exists() else {"eval": True}
     if (projection := options.get("projection", PROJECTIONS[0])) not in PROJECTIONS:
         raise InputError(f"{args}: expected a projection of {', '.join(PROJECTIONS)}, found {projection!r:.40}.")
-    options = {"antialiasing": found.antialiased, "linear_light": found.linear, **options}
+    options = {"antialiasing": found.antialiased, "linear_light": found.linear or None, **options}
     marks = {"antialiased": bool(options["antialiasing"]), "linear": bool(options["linear_light"])}
     return iteration, found._replace(splats=cropped(found.splats, crop), **marks), options
 

@@ -129,7 +129,7 @@ def photographed(image: torch.Tensor, view: View, exposures: Exposures | None) -
     height, width, _ = image.shape
     pixels, camera = view.pixels, view.camera.resized(width, height)
     taken = image_at(torch.from_numpy(pixels.image).float(), camera, "area") / (1 if view.linear else 255)
-    more = taken - as_photographed(image, exposures, view.name)
+    more = taken - as_photographed(exposures, image, view.name)
     if pixels.mask is not None:
         more = more * image_at(torch.from_numpy(pixels.mask[..., None]), camera).bool()
     return image + more

@@ -27,7 +27,7 @@ from warp_splat.formats.png import save_png, save_video
 from warp_splat.gaussians import GaussianModel
 from warp_splat.raster.selftest import settle_device
 from warp_splat.rendering.camera_paths import ORBIT_LENS, focus_orbit, origin_orbit, path_cameras, spiral_cameras
-from warp_splat.rendering.finished import Finished
+from warp_splat.rendering.finished import Finished, as_photographed
 from warp_splat.rendering.popping import popping_of
 from warp_splat.runtime.devices import memory_explained
 from warp_splat.scene.types import Scene, View
@@ -146,7 +146,8 @@ def render_model(config: RenderConfig) -> int:
             if test:
                 extra = {"split": "test", "gaussians": len(model)}
                 seen = activated, finished.background(device), options, given.extent
-                where = where_taken(*seen) if scene is not given else None
+                finish = partial(as_photographed, finished.exposures)
+                where = where_taken(*seen, finish) if scene is not given else None
                 means, compared = evaluate_views(picture, test, folder, "test", iteration, extra, metrics, where)
                 show_views(compared, folder, "test", iteration, say)
                 print(f"  test   {len(test)} views in {folder / 'test' / f'ours_{iteration}'}")

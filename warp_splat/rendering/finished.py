@@ -71,8 +71,9 @@ class Finished:
         return [f"{what}, which no format has" for what, owes in owed.items() if owes]
 
     def is_linear(self, scene: Scene | None) -> bool:
-        """Whether its colors are in linear light: as its scene's are, or as its training or its file says."""
-        return bool(self.trained.get("linear_light")) or (scene is not None and scene.linear)
+        """Whether its colors are in linear light: as its training or its file says, else as its scene's are."""
+        told = self.trained.get("linear_light")
+        return bool(told) if told is not None else scene is not None and scene.linear
 
     def background(self, device: torch.device) -> torch.Tensor:
         """What lies behind the Gaussians: a color [3]; or the harmonics [16, 3] in its place, if there are any."""
@@ -92,7 +93,7 @@ class Finished:
         ``scene``: that of the model, if it is known.
         """
         draw, linear = self.renderer(model, options), self.is_linear(scene)
-        return lambda camera, name="": to_bytes(as_photographed(draw(camera).image, self.exposures, name), linear)
+        return lambda camera, name="": to_bytes(as_photographed(self.exposures, draw(camera).image, name), linear)
 
     def load_scene(self, source_path: str, say: Callable[[str], object]) -> Scene:
         """The scene that it was trained on, as it was loaded then.
@@ -165,7 +166,7 @@ def make_renderer(
     return draw
 
 
-def as_photographed(image: torch.Tensor, exposures: Exposures | None, name: str) -> torch.Tensor:
+def as_photographed(exposures: Exposures | None, image: torch.Tensor, name: str) -> torch.Tensor:
     """The image [H, W, 3] as the photograph of this name shows it; as it is, if that one is not known."""
     if exposures is None or name not in exposures.maps:
         return image

@@ -203,7 +203,7 @@ def read_mask(path: Path, size: tuple[int, int], invert: bool) -> np.ndarray:
 
 
 def read_numbers(path: Path) -> np.ndarray:
-    """The first channel of a file [H, W] float64: floats as they are, 16-bit numbers as shares of 65536.
+    """Channel Z of a file, or the first beside alpha, [H, W]: floats as they are, 16-bit numbers as shares of 65536.
 
     Raises:
         InputError: if it has neither, or is not an image that OpenImageIO reads.
@@ -211,7 +211,9 @@ def read_numbers(path: Path) -> np.ndarray:
     file = _open(path)
     if (kind := file.spec().format).basetype not in (*FLOATS, oiio.BASETYPE.UINT16):
         raise InputError(f"{path}: expected numbers of 16 bits or floats, found {kind}; save it as 16-bit PNG or EXR.")
-    numbers = _decoded(path, file, 0, 0, 0, 1, oiio.FLOAT if kind.basetype in FLOATS else oiio.UINT16)
+    names = [name.upper() for name in file.spec().channelnames]
+    first = min(range(len(names)), key=lambda place: (names[place] != "Z", names[place] == "A"))
+    numbers = _decoded(path, file, 0, 0, first, first + 1, oiio.FLOAT if kind.basetype in FLOATS else oiio.UINT16)
     return numbers[..., 0] / (1.0 if kind.basetype in FLOATS else 2.0**16)
 
 

@@ -128,7 +128,12 @@ def open_scene(config: TrainConfig, begun: Checkpoint | None, say: Report, proce
     memory = photo_memory(config.machine.photo_memory, processes)
     scene = load_scene(data.source_path, **same, start=start, memory=memory, report=say)
     if begun:
-        scene.refuse_other_frame(begun.path.parent, read_coordinates(begun.path.parent))
+        folder = begun.path.parent
+        scene.refuse_other_frame(folder, read_coordinates(folder))
+        before = model_folder.read_cfg_args(folder) if (folder / "cfg_args").exists() else {}
+        if bool(before.get("linear_light", scene.linear)) != scene.linear:
+            expected = f"expected photographs {'not ' * scene.linear}in linear light, as {folder} was trained on"
+            raise InputError(f"{data.source_path}: {expected}, found others; name those of then (-s), or start anew.")
         return scene
     if scene.block and scene.block.empty:  # before blocks are trained that could not be merged
         which = f"none of block {scene.block.empty[0] + 1}"
@@ -142,8 +147,10 @@ def open_scene(config: TrainConfig, begun: Checkpoint | None, say: Report, proce
         if scene.start.antialiased != config.model.antialiasing:
             which = "with" if scene.start.antialiased else "without"
             say(f"Warning: {start} was trained {which} --antialiasing; the same option keeps its sizes right.")
-        if scene.start.linear and not scene.linear:
-            say(f"Warning: {start} is in linear light, and the photographs are not; its colors start too dark.")
+        if scene.start.linear != scene.linear:
+            dark = f"{start} is in linear light, and the photographs are not; its colors start too dark."
+            bright = f"the photographs are in linear light. If {start} is not, its colors start too bright."
+            say(f"Warning: {bright if scene.linear else dark}")
     return scene
 
 

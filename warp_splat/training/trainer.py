@@ -4,6 +4,7 @@ import math
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -334,7 +335,7 @@ class Trainer:
 
     def picture(self, camera: Camera, name: str = "") -> np.ndarray:
         """The present model seen by ``camera``, [H, W, 3] uint8, exposed as the photograph of this name."""
-        return to_bytes(as_photographed(self.look(camera).image, self.exposures, name), self.scene.linear)
+        return to_bytes(as_photographed(self.exposures, self.look(camera).image, name), self.scene.linear)
 
     def refined(self, views: list[View]) -> list[View]:
         """The views, with the cameras that parts have learned."""
@@ -347,7 +348,8 @@ class Trainer:
         """A function from a held-out view to where the model says that it was taken, if parts refine cameras."""
         if not having(self.parts, "refined") or not self.scene.test:
             return None
-        return where_taken(self.model.activated(self.degree), self.behind, self.options, self.scene.extent)
+        seen = self.model.activated(self.degree), self.behind, self.options, self.scene.extent
+        return where_taken(*seen, partial(as_photographed, self.exposures))
 
     def evaluate(self, views: list[View]) -> float:
         """Mean PSNR [dB] of 8-bit renders against the photographs, as a screen shows both."""

@@ -180,7 +180,7 @@ class Viewer(AbstractContextManager):
         out = self.draw_camera(camera, kind == "depth")
         if view is not None:
             name = view.name.removesuffix(AS_GIVEN)
-            out.image[box] = as_photographed(out.image[box].clone(), self.exposures(), name)
+            out.image[box] = as_photographed(self.exposures(), out.image[box].clone(), name)
         frame, note = paint(out, kind, self.linear)
         if view is not None and watcher.opacity.value > 0:
             frame = overlay(frame, view.picture, box, watcher.opacity.value)
