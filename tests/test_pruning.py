@@ -83,7 +83,7 @@ def test_an_image_loses_what_the_adjoint_says(device):
     with torch.no_grad():
         gaussians = GaussianModel.from_splats(splats).to(torch.device(device)).activated()
     found = carried(gaussians, setting.views[0], setting, upstream)
-    lost = (found.adj_opacities * found.splats.opacities.detach()).cpu().double()
+    lost = (found.opacities.grad * found.opacities.detach()).cpu().double()
     whole = drawn(splats, setting, camera)
     for row in range(len(splats.means)):
         wanted = float((upstream.double() * (whole - drawn(without(splats, row), setting, camera))).sum())

@@ -20,14 +20,6 @@ from warp_splat.raster.project import project
 from warp_splat.scene.types import View
 
 
-class Carried(NamedTuple):
-    """A view of N Gaussians, and the adjoint of its blend."""
-
-    splats: Splats2D
-    adj_colors: torch.Tensor  # [N, 3] sums over the pixels of weight times upstream gradient
-    adj_opacities: torch.Tensor  # [N]
-
-
 class Costs(NamedTuple):
     """What leaving out would change, as squared differences summed over pixels, channels and views, float64."""
 
@@ -43,14 +35,17 @@ class ViewSetting(NamedTuple):
     background: torch.Tensor  # [3], or harmonics [16, 3]
 
 
-def carried(gaussians: Gaussians, view: View, setting: ViewSetting, upstream: torch.Tensor) -> Carried:
-    """The adjoint of the blend of a view alone.
+def carried(gaussians: Gaussians, view: View, setting: ViewSetting, upstream: torch.Tensor) -> Splats2D:
+    """A view, with gradients of its blend alone.
 
     Args:
         gaussians: activated, without gradients.
         view: whose mask counts.
         setting: how it is rendered.
         upstream: gradient of the image, [H, W, 3].
+
+    Returns:
+        Its splats. Of colors, gradients are sums over the pixels of weight times upstream; opacities have them, too.
     """
     upstream = upstream.to(gaussians.means.device)
     if view.mask is not None:
@@ -59,15 +54,15 @@ def carried(gaussians: Gaussians, view: View, setting: ViewSetting, upstream: to
         splats = project(gaussians, view.camera, setting.options)
     colors, opacities = (tensor.detach().requires_grad_() for tensor in (splats.colors, splats.opacities))
     splats = splats._replace(colors=colors, opacities=opacities)
-    image = render(gaussians, view.camera, setting.background, setting.options, splats=splats).image
-    return Carried(splats, *torch.autograd.grad(image, (colors, opacities), upstream))
+    render(gaussians, view.camera, setting.background, setting.options, splats=splats).image.backward(upstream)
+    return splats
 
 
 def weights(gaussians: Gaussians, view: View, setting: ViewSetting) -> tuple[torch.Tensor, torch.Tensor]:
     """The share of a view's pixels that each Gaussian covers, [N] float64, and its depth [N], world units."""
     camera = view.camera
     found = carried(gaussians, view, setting, torch.ones(camera.height, camera.width, 3))
-    return found.adj_colors[:, 0].double() / (camera.height * camera.width), found.splats.depths
+    return found.colors.grad.double()[:, 0] / (camera.height * camera.width), found.depths
 
 
 def costs(model: GaussianModel, setting: ViewSetting) -> Costs:
@@ -84,10 +79,10 @@ def costs(model: GaussianModel, setting: ViewSetting) -> Costs:
     for number, view in enumerate(setting.views):
         generator, size = torch.Generator().manual_seed(number), (view.camera.height, view.camera.width, 3)
         found = carried(gaussians, view, setting, 2.0 * torch.randint(0, 2, size, generator=generator) - 1.0)
-        whole += (found.adj_opacities.double() * found.splats.opacities.detach()) ** 2
-        squares = (found.adj_colors.double() ** 2).mean(1)
+        whole += (found.opacities.grad.double() * found.opacities.detach()) ** 2
+        squares = (found.colors.grad.double() ** 2).mean(1)
         for degree in range(degrees):
             with torch.no_grad():
                 colors = project(gaussians, view.camera, replace(setting.options, sh_degree=degree)).colors
-            harmonics[:, degree] += squares * ((colors - found.splats.colors.detach()).double() ** 2).sum(1)
+            harmonics[:, degree] += squares * ((colors - found.colors.detach()).double() ** 2).sum(1)
     return Costs(whole, harmonics)
