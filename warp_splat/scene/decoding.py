@@ -16,7 +16,7 @@ from warp_splat.camera import Camera
 from warp_splat.errors import InputError
 from warp_splat.runtime.launch import available_memory
 from warp_splat.scene.images import PIXELS_MOST, THREADS, Photo, decode, read_kind, target_size
-from warp_splat.scene.types import Decoded, PhotoMemory, Stored, View
+from warp_splat.scene.types import PhotoMemory, Stored, View
 
 SHARE = 0.25  # of the memory that is free, for photographs
 AHEAD = 4  # photographs that are decoded before they are asked for
@@ -78,14 +78,10 @@ def _resized(photo: Photo, resolution: int) -> Camera:
 
 def in_turn(views: Sequence[View]) -> Iterator[View]:
     """The views with their photographs in memory, of which threads decode the next ones meanwhile."""
-    coming: deque = deque()
+    coming: deque[Future[View]] = deque()
     with ThreadPoolExecutor(THREADS) as pool:
         for view in views:
-            coming.append((view, pool.submit(view.photograph.read)))
+            coming.append(pool.submit(lambda view: replace(view, photograph=view.pixels), view))
             if len(coming) > AHEAD:
-                yield _loaded(*coming.popleft())
-        yield from (_loaded(*each) for each in coming)
-
-
-def _loaded(view: View, read: Future[Decoded]) -> View:
-    return replace(view, photograph=read.result())
+                yield coming.popleft().result()
+        yield from (each.result() for each in coming)
