@@ -177,11 +177,9 @@ class _Bundle:
 
     def _bytes(self, name: str, most: int) -> bytes:
         """A file of the archive, of at most ``most`` bytes."""
-        try:
-            info = self.archive.getinfo(name)
-        except KeyError:
-            raise files.Unexpected(f"no file {name!r:.80} in it") from None
-        if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        if name not in self.archive.namelist():
+            raise files.Unexpected(f"no file {name!r:.80} in it")
+        if (info := self.archive.getinfo(name)).compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
             raise files.Unexpected(f"{name!r:.80} in another compression than deflate")
         with self.archive.open(info) as source:
             data = source.read(most + 1)
