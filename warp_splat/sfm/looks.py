@@ -34,11 +34,8 @@ def described_by_words(features: Callable[[int], np.ndarray], count: int, seed: 
         seed: of the vocabulary.
     """
     random = np.random.default_rng(seed)
-    sample = []
-    for index in range(count):
-        found = features(index)
-        sample.append(found[random.permutation(len(found))[: -(-SAMPLE // count)]].astype(np.float32))
-    known = np.concatenate(sample)
+    share, every = -(-SAMPLE // count), map(features, range(count))
+    known = np.concatenate([found[random.permutation(len(found))[:share]].astype(np.float32) for found in every])
     words = vocabulary(known if len(known) else np.zeros((1, known.shape[1]), np.float32), random)
     described = np.zeros((count, *words.shape), np.float32)
     for index in range(count):
