@@ -107,7 +107,8 @@ class Reference:
         clone, split = chosen[~splits[chosen]], chosen[splits[chosen]]
         added = self._children(raw, split)
         added = {name: torch.cat([raw[name][clone], added[name]]) for name in raw}
-        keep, keep_added = self._survivors(raw, prune_large), self._survivors(added, prune_large)
+        widest = _log(PRUNE_EXTENT * self.extent) if prune_large else math.inf
+        keep, keep_added = (survivors(some, widest) for some in (raw, added))
         if self.options.prune_screen_size and prune_large:
             keep &= self.radius <= self.options.prune_screen_size
         keep[split] = False
@@ -140,16 +141,11 @@ class Reference:
         rows["scales"] = rows["scales"] - math.log(SPLIT_SHRINK)
         return rows
 
-    def _survivors(self, raw: dict[str, torch.Tensor], prune_large: bool) -> torch.Tensor:
-        keep = survivors(raw)
-        if prune_large:
-            keep &= raw["scales"].amax(1) <= _log(PRUNE_EXTENT * self.extent)
-        return keep
 
-
-def survivors(raw: dict[str, torch.Tensor]) -> torch.Tensor:
-    """Which Gaussians are finite, and not too faint to be seen [N]."""
+def survivors(raw: dict[str, torch.Tensor], widest: float = math.inf) -> torch.Tensor:
+    """Which Gaussians are finite, not too faint to be seen, and no wider than the logarithm ``widest`` [N]."""
     keep = raw["opacities"] >= math.log(PRUNE_OPACITY / (1.0 - PRUNE_OPACITY))
+    keep &= raw["scales"].amax(1) <= widest
     for tensor in raw.values():  # one that is not finite is left out of every image, so nothing else would prune it
         keep &= torch.cat([torch.isfinite(part)[..., None].flatten(1).all(1) for part in tensor.split(CHUNK)])
     return keep
