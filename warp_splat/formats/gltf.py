@@ -20,7 +20,7 @@ from warp_splat.errors import InputError
 from warp_splat.formats.coordinates import kept
 from warp_splat.formats.files import Unexpected, atomic_write, entries_of, reading, write_bytes
 from warp_splat.formats.gltf_container import CHUNK, HEADER, VISIBILITY, Document, held
-from warp_splat.formats.splats import COEFFICIENTS, SplatArrays, SplatFile, concatenated, frame, placed, turned
+from warp_splat.formats.splats import COEFFICIENTS, SplatArrays, SplatFile, frame, of_parts, placed, turned
 from warp_splat.formats.stored import LOG_SCALES, SH_C0, clipped, log_scales, logit, sigmoid, unit_quats
 from warp_splat.text import Report
 
@@ -30,7 +30,6 @@ UNDERSTOOD = {NAME, "KHR_mesh_quantization", VISIBILITY}  # extensions that a fi
 COLOR_SPACES = ("srgb_rec709_display", "lin_rec709_display")  # as photographs have it; in linear light
 RENDER_MODE = "SplatRenderMode"
 INSTANCES = "EXT_mesh_gpu_instancing"
-SOME_MIP = "only some of its parts are antialiased; all are drawn as if none were"
 COORDINATES = "coordinates"
 MOST_PIECES = 4096  # meshes; the Gaussians of a scene are one or a few
 LEAST_BYTES = 23  # of a Gaussian: bytes for position, rotation, scale and opacity, three floats for the color
@@ -107,10 +106,8 @@ def load_gltf(path: str | Path, report: Report = print) -> SplatFile:
         mip = [held(extension, "extras").get(RENDER_MODE) == "mip" for extension in told]
         if any(INSTANCES in held(node, "extensions") for node in entries_of(document.json, "nodes")):
             notes.append(f"{INSTANCES} repeats nothing here; export nodes instead to draw all")
-        notes += [SOME_MIP] * (any(mip) and not all(mip))
-    for note in dict.fromkeys(notes):
-        report(f"{path}: {note}.")
-    return SplatFile(concatenated(parts), all(mip), kept(held(document.json, "extras").get(COORDINATES)), linear.pop())
+        coordinates = kept(held(document.json, "extras").get(COORDINATES))
+    return of_parts(path, parts, mip, notes, report)._replace(coordinates=coordinates, linear=linear.pop())
 
 
 def _attributes(splats: SplatArrays, in_linear: bool, report: Report) -> dict[str, np.ndarray]:

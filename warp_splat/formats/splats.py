@@ -18,6 +18,7 @@ from warp_splat.text import Report
 
 COEFFICIENTS = (1, 4, 9, 16)  # of the spherical harmonics up to degree 0, 1, 2, 3
 AXIS = {"R": (1, 0, 0), "L": (-1, 0, 0), "D": (0, 1, 0), "U": (0, -1, 0), "F": (0, 0, 1), "B": (0, 0, -1)}
+SOME_MIP = "only some of its parts are antialiased; all are drawn as if none were"
 EVEN = 1e-4  # by how much the axes of a transform may differ in length, or lean
 
 
@@ -165,6 +166,14 @@ def concatenated(parts: Sequence[SplatArrays]) -> SplatArrays:
     most = max(part.sh.shape[1] for part in parts)
     padded = [part._replace(sh=np.pad(part.sh, ((0, 0), (0, most - part.sh.shape[1]), (0, 0)))) for part in parts]
     return SplatArrays(*(np.concatenate(arrays) for arrays in zip(*padded, strict=True)))
+
+
+def of_parts(path, parts: Sequence[SplatArrays], mip: Sequence[bool], notes: list[str], report: Report) -> SplatFile:
+    """The Gaussians of a file's parts, of which ``mip`` tells which are antialiased; ``report`` gets each note once."""
+    notes = [*notes, *[SOME_MIP] * (any(mip) and not all(mip))]
+    for note in dict.fromkeys(notes):
+        report(f"{path}: {note}.")
+    return SplatFile(concatenated(parts), all(mip))
 
 
 def _turn_harmonics(turn: np.ndarray, coefficients: int) -> np.ndarray:

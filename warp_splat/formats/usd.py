@@ -22,8 +22,8 @@ import numpy as np
 from warp_splat.errors import InputError
 from warp_splat.formats.coordinates import kept
 from warp_splat.formats.files import Unexpected, atomic_write, reading
-from warp_splat.formats.gltf import COORDINATES, RENDER_MODE, SOME_MIP
-from warp_splat.formats.splats import COEFFICIENTS, SplatArrays, SplatFile, concatenated, frame, placed, turned
+from warp_splat.formats.gltf import COORDINATES, RENDER_MODE
+from warp_splat.formats.splats import COEFFICIENTS, SplatArrays, SplatFile, frame, of_parts, placed, turned
 from warp_splat.formats.stored import LOG_SCALES, clipped, log_scales, logit, sigmoid, unit_quats
 from warp_splat.text import Report
 
@@ -132,12 +132,9 @@ def load_usd(path: str | Path, report: Report = print) -> SplatFile:
             world = np.array(places.GetLocalToWorldTransform(prim)).T  # USD multiplies from the left
             parts.append(placed(_read_prim(prim, now, notes.append), world, axes, notes.append, unit))
         mip = [prim.GetCustomDataByKey(RENDER_MODE) == "mip" for prim in prims]
-        notes += [SOME_MIP] * (any(mip) and not all(mip))
         told = stage.GetRootLayer().customLayerData.get(COORDINATES, "null")
         coordinates = kept(json.loads(told)) if isinstance(told, str) else None
-    for note in dict.fromkeys(notes):
-        report(f"{path}: {note}.")
-    return SplatFile(concatenated(parts), all(mip), coordinates)
+    return of_parts(path, parts, mip, notes, report)._replace(coordinates=coordinates)
 
 
 def _read_prim(prim, now, report: Report) -> SplatArrays:
