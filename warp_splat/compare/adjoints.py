@@ -16,7 +16,6 @@ import torch
 
 from warp_splat.compare.truth import TAPE, Error, Truth, compute_truth, errors_of, gradients_of, run_passes
 from warp_splat.compare.workloads import CAPS, Workload
-from warp_splat.config import RasterOptions
 from warp_splat.errors import InputError
 from warp_splat.raster.api import render
 from warp_splat.runtime import timers
@@ -37,9 +36,9 @@ class Variant:
     adjoint: str
     changes: Mapping[str, Any] = field(default_factory=dict)  # of RasterOptions
 
-    def options(self, workload: Workload) -> RasterOptions:
-        """The workload's options with this variant's changes."""
-        return replace(workload.options, **self.changes)
+    def of(self, workload: Workload) -> Workload:
+        """The workload, with this variant's changes of its options."""
+        return replace(workload, options=replace(workload.options, **self.changes))
 
 
 @dataclass
@@ -96,16 +95,16 @@ def run_adjoints(workloads: Sequence[Workload], modes: Sequence[str], say: Repor
 def first_run(workload: Workload, truth: Truth, variant: Variant) -> Measurement:
     """Error and memory; compiles and warms up the kernels."""
     result = Measurement(workload.name, variant.name, len(workload.gaussians.means))
-    options = variant.options(workload)
+    workload = variant.of(workload)
     try:
-        image, gradients = gradients_of(workload, truth, variant.adjoint, options)
+        image, gradients = gradients_of(workload, truth, variant.adjoint)
     except InputError as error:  # stored refuses what does not fit
         return replace(result, extrapolated=True, note=str(error))
     result.errors = errors_of(gradients, truth)
     sure = (image - truth.image).abs()[truth.sure]
     result.image_error = float(sure.max()) if len(sure) else float("nan")
     if variant.name != TAPE:  # whose arrays are Warp's
-        result.memory = peak_of(lambda: run_passes(workload, variant.adjoint, options), workload.device)
+        result.memory = peak_of(lambda: run_passes(workload, variant.adjoint), workload.device)
     return result
 
 
@@ -116,7 +115,7 @@ def time_all(workload: Workload, found: dict[Variant, Measurement]) -> None:
     while rounds < REPEATS and (rounds < 2 or time.perf_counter() - start < BUDGET):
         for variant, measured in stages_of.items():
             with timers.profile() as stages:
-                run_passes(workload, variant.adjoint, variant.options(workload))
+                run_passes(variant.of(workload), variant.adjoint)
             measured.append(dict(stages))
         rounds += 1
     for variant, measured in stages_of.items():

@@ -75,9 +75,7 @@ def _by_parameter(gradients: Sequence[torch.Tensor]) -> dict[str, torch.Tensor]:
     return dict(zip(PARAMETERS, (*geometry, torch.cat([sh_dc, sh_rest], 1), background, means2d), strict=True))
 
 
-def gradients_of(
-    workload: Workload, truth: Truth, adjoint: str, options: RasterOptions
-) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+def gradients_of(workload: Workload, truth: Truth, adjoint: str) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
     """The renderer's image [P, 3] at the workload's pixels, and its gradients for the truth's upstream gradient.
 
     All on the host. :data:`TAPE` tells nothing of the 2D means.
@@ -89,19 +87,19 @@ def gradients_of(
         image, found = differentiate_on_tape(workload, upstream)
         return image[rows, columns].cpu(), {name: grad.cpu() for name, grad in found.items()}
     *leaves, background = (tensor.clone().requires_grad_() for tensor in (*workload.gaussians, workload.background))
-    out = render(Gaussians(*leaves), workload.camera, background, options, adjoint)
+    out = render(Gaussians(*leaves), workload.camera, background, workload.options, adjoint)
     found = torch.autograd.grad(out.image, [*leaves, background, out.means2d], upstream)
     return out.image.detach()[rows, columns].cpu(), _by_parameter(found)
 
 
-def run_passes(workload: Workload, adjoint: str, options: RasterOptions) -> None:
+def run_passes(workload: Workload, adjoint: str) -> None:
     """A forward and a backward pass over the whole image, to be timed."""
     upstream = workload.background.new_ones(workload.camera.height, workload.camera.width, 3)
     if adjoint == TAPE:
         differentiate_on_tape(workload, upstream)
         return
     leaves = Gaussians(*(tensor.clone().requires_grad_() for tensor in workload.gaussians))
-    render(leaves, workload.camera, workload.background, options, adjoint).image.backward(upstream)
+    render(leaves, workload.camera, workload.background, workload.options, adjoint).image.backward(upstream)
 
 
 def differentiate_on_tape(workload: Workload, upstream: torch.Tensor) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
