@@ -26,11 +26,10 @@ DOTS = 1500  # points drawn on a photograph
 MOST = 3.0  # px; larger errors have the same color
 MAPPED = 5000  # points drawn on the map
 PAGE_DPI = 110
+Captioned = Iterable[tuple[str, str]]  # captions, and addresses with the pictures themselves
 
 
-def write_page(
-    path: Path, title: str, verdict: str, findings: list[Finding], pictures: Iterable[tuple[str, str]]
-) -> None:
+def write_page(path: Path, title: str, verdict: str, findings: list[Finding], pictures: Captioned) -> None:
     """Write the verdict, a row for each finding, and the pictures (captions, addresses of data).
 
     Raises:
@@ -49,7 +48,7 @@ def write_page(
     write_text(path, page.substitute(title=escape(title), verdict=escape(verdict), rows=rows, figures=figures))
 
 
-def draw_pictures(subject: Subject) -> Iterable[tuple[str, str]]:
+def draw_pictures(subject: Subject) -> Captioned:
     """Captions and pictures, as addresses of data that a page holds itself."""
     if not (shown := [photo for photo in subject.photos if photo.name in subject.thumbnails]):
         return
