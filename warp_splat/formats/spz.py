@@ -24,7 +24,7 @@ from warp_splat.formats.splats import COEFFICIENTS, SplatArrays, SplatFile, fram
 from warp_splat.formats.stored import clipped, from_smallest_three, logit, sigmoid, smallest_three, unit_quats
 from warp_splat.text import Report
 
-MAGIC = b"NGSP"
+MAGIC, GZIP = b"NGSP", b"\x1f\x8b"
 DAMAGE = (zlib.error, EOFError, gzip.BadGzipFile, zstandard.ZstdError)  # what libraries raise then
 HEADER = struct.Struct("<4sIIBBBB")  # magic, version, count, SH degree, fractional bits, flags, streams (version 4)
 HEADER4 = struct.Struct("<4sIIBBBBI12x")  # ... and where the table of sizes begins
@@ -91,12 +91,9 @@ def load_spz(path: str | Path, report: Report = print) -> SplatFile:
     """
     with reading(path, "an SPZ file of version 2, 3 or 4", *DAMAGE), open(path, "rb") as source:
         start, file_bytes = source.peek(4)[:4], os.fstat(source.fileno()).st_size
-        if start == MAGIC:
-            header, streams, records = _read_zstd(source, file_bytes)
-        elif start[:2] == b"\x1f\x8b":
-            header, streams, records = _read_gzip(source, file_bytes)
-        else:
+        if start != MAGIC and start[:2] != GZIP:
             raise Unexpected(f"a file that begins with {start!r}; it may be another format, or cut short")
+        header, streams, records = (_read_zstd if start == MAGIC else _read_gzip)(source, file_bytes)
         _, version, count, degree, fraction_bits, flags, *_ = header
         axes, splats = _find_axes(records), _unpack(streams, version, degree, fraction_bits)
     if degree == 4:
