@@ -53,11 +53,11 @@ def load_splat(path: str | Path, report: Report = print) -> SplatFile:
         if (size := os.fstat(source.fileno()).st_size) == 0 or size % ROW.itemsize:
             raise Unexpected(f"{size} bytes; it may be cut short")
         rows = np.fromfile(source, ROW, size // ROW.itemsize)
-    splats = SplatArrays(
-        means=rows["mean"].astype(np.float32),
-        sh=((rows["rgba"][:, None, :3] / np.float32(255) - np.float32(0.5)) / np.float32(SH_C0)),
-        opacities=logit(rows["rgba"][:, 3] / 255),
-        scales=log_scales(rows["scale"]),
-        quats=(rows["quat"].astype(np.float32) - 128) / 128,
-    )
-    return SplatFile(splats)
+        splats = SplatArrays(
+            means=rows["mean"].astype(np.float32),
+            sh=((rows["rgba"][:, None, :3] / np.float32(255) - np.float32(0.5)) / np.float32(SH_C0)),
+            opacities=logit(rows["rgba"][:, 3] / 255),
+            scales=log_scales(rows["scale"]),
+            quats=(rows["quat"].astype(np.float32) - 128) / 128,
+        )
+        return SplatFile(splats)

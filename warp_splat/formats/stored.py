@@ -23,9 +23,11 @@ def logit(opacities: np.ndarray) -> np.ndarray:
 
 
 def log_scales(scales: np.ndarray) -> np.ndarray:
-    """Logarithms of standard deviations; 0 (a flat Gaussian) gives the last finite one, less gives NaN."""
-    with np.errstate(invalid="ignore"):
-        return np.log(np.where(scales == 0, np.finfo(np.float32).tiny, scales)).astype(np.float32)
+    """Logarithms of standard deviations; 0 (a flat Gaussian) gives the last finite one, less gives NaN.
+
+    Called while a file is read: then NumPy does not warn.
+    """
+    return np.log(np.where(scales == 0, np.finfo(np.float32).tiny, scales)).astype(np.float32)
 
 
 def unit_quats(quats: np.ndarray) -> np.ndarray:
