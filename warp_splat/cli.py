@@ -57,13 +57,11 @@ def add_flags(parser: argparse.ArgumentParser, config_type: type) -> None:
         if isinstance(default, bool):
             options["action"] = argparse.BooleanOptionalAction
         else:
-            options["type"] = item.metadata["many"] or type(default)
-            options["metavar"] = options["type"].__name__.upper()
-            options["choices"] = item.metadata["choices"]
-            if options["choices"]:
-                options["metavar"] = f"{{{','.join(str(choice) for choice in options['choices'] if choice != '')}}}"
-            if item.metadata["many"]:
-                options["nargs"] = "*"
+            many, choices = item.metadata["many"], item.metadata["choices"]
+            kind = many or type(default)
+            named = ",".join(str(choice) for choice in choices or () if choice != "")
+            metavar = f"{{{named}}}" if choices else kind.__name__.upper()
+            options |= {"type": kind, "choices": choices, "metavar": metavar, "nargs": "*" if many else None}
         groups[title] = groups.get(title) or parser.add_argument_group(title)
         groups[title].add_argument(*item.metadata["names"], f"--{item.name}", dest=item.name, **options)
 
