@@ -50,12 +50,10 @@ class Document:
         self.path = Path(path)
         size = self.path.stat().st_size
         with open(self.path, "rb") as source:
-            if source.peek(4)[:4] == b"glTF":
-                text, chunk = self._read_chunks(source, size)
-            elif size > JSON_BYTES:
+            binary = source.peek(4)[:4] == b"glTF"
+            if not binary and size > JSON_BYTES:
                 raise Unexpected(f"a JSON file of {size} bytes, more than {JSON_BYTES}")
-            else:
-                text, chunk = source.read(), None
+            text, chunk = self._read_chunks(source, size) if binary else (source.read(), None)
         self.json = json_object(text)
         if (count := len(entries_of(self.json, "buffers"))) > MOST_BUFFERS:
             raise Unexpected(f"{count} buffers, more than {MOST_BUFFERS}")
