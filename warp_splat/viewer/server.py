@@ -25,7 +25,7 @@ from warp_splat.raster.api import RenderOutput
 from warp_splat.rendering.camera_paths import focus_point, overview
 from warp_splat.rendering.finished import as_photographed
 from warp_splat.runtime.devices import memory_explained
-from warp_splat.scene.types import Scene, View
+from warp_splat.scene.types import Scene
 from warp_splat.viewer.browser_camera import USUAL_WINDOW, fitting_fov, pivot
 from warp_splat.viewer.picture import KINDS, overlay, paint
 from warp_splat.viewer.watcher import LARGEST, MOST, Watcher, pixels_after
@@ -68,9 +68,8 @@ class Viewer(AbstractContextManager):
     ):
         self.draw_camera, self.model, self.linear, self.exposures = draw, model, linear, exposures
         self.unit = " m" if scene and scene.coordinates else ""
-        self.views: dict[str, View] = {}
+        self.views = {view.name: view for view in (*scene.train, *scene.test)} if scene else {}
         if scene:
-            self.views = {view.name: view for view in (*scene.train, *scene.test)}
             self.subject, up, _ = focus_point(scene)
             camera = scene.train[0].camera
         else:
