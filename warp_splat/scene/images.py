@@ -70,12 +70,10 @@ def target_size(width: int, height: int, resolution: int) -> tuple[int, int]:
         height: image height [px].
         resolution: 1, 2, 4 or 8 divides; another positive value is the width to reach; -1 shrinks to 1600 px at most.
     """
-    if resolution in (1, 2, 4, 8):
-        size = round(width / resolution), round(height / resolution)
-    else:
-        scale = max(width / AUTO_WIDTH, 1.0) if resolution == -1 else width / resolution
-        size = int(width / scale), int(height / scale)
-    return max(size[0], 1), max(size[1], 1)
+    scale, whole = (resolution, round) if resolution in (1, 2, 4, 8) else (width / resolution, int)
+    if resolution == -1:
+        scale = max(width / AUTO_WIDTH, 1.0)
+    return max(whole(width / scale), 1), max(whole(height / scale), 1)
 
 
 def read_size(path: Path) -> tuple[int, int]:
