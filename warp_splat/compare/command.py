@@ -43,10 +43,8 @@ def run(config: CompareConfig) -> int:
         print(text)
         log.append(text)
 
-    code = 0
-    if config.stability:
-        code = int(cases.run_cases(out, config.modes, say) > 0)
-    else:
+    failed = cases.run_cases(out, config.modes, say) if config.stability else 0
+    if not config.stability:
         workloads = [layered(candidates).to(device) for candidates in CANDIDATES]
         for name, scene in scenes.items():
             workloads += in_training(name, scene, device, say)
@@ -55,7 +53,7 @@ def run(config: CompareConfig) -> int:
     say(f"\nMeasured on {card}{machine()}, {pool.get_threads()} threads.")
     write_text(out / ("stability.txt" if config.stability else "compare.txt"), "\n".join([*log, ""]))
     print(f"Tables and plots: {out}")
-    return code
+    return int(failed > 0)
 
 
 def _compare_modes(workloads: list[Workload], modes: list[str], out: Path, say: Report) -> None:
