@@ -17,6 +17,7 @@ from commands import python
 
 import warp_splat
 from warp_splat.runtime import launch, pool
+from warp_splat.runtime.interrupts import later
 
 NAMES = warp_splat.__all__
 
@@ -148,6 +149,17 @@ def test_an_interrupted_launch_waits_for_its_helpers(threads):
     finally:
         signal.signal(signal.SIGINT, before)
     assert len(ended) == 1
+
+
+def test_ctrl_c_comes_once_a_library_is_loaded():
+    before, loaded = signal.signal(signal.SIGINT, signal.default_int_handler), False
+    try:
+        with pytest.raises(KeyboardInterrupt), later():
+            signal.raise_signal(signal.SIGINT)
+            loaded = True
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert loaded
 
 
 def test_an_interrupt_at_any_step_leaves_nothing_locked(threads):

@@ -6,10 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scene_files
+from commands import SCENE
 from hostile import refusal, replace
 from scene_files import HEIGHT, WIDTH, load, pose, scale_axes, texture, write_blender, write_colmap, write_image
 
-from warp_splat.scene.images import read_size
+from warp_splat.scene.images import read_size, same_shape
 
 
 def cut(path, keep):
@@ -196,3 +197,14 @@ def test_pose_that_is_not_finite_names_the_image(tmp_path, place):
 def test_a_name_that_is_no_utf_8_gets_a_sentence(tmp_path):
     """As in an old archive; OpenImageIO takes none."""
     refusal(lambda: read_size(tmp_path / os.fsdecode(b"caf\xe9.png")), r"caf\udce9.png", "rename the file")
+
+
+def test_a_photograph_of_a_pixel_is_no_smaller_copy():
+    assert same_shape((5, 8), (266, 474)) and not same_shape((1, 1), (266, 474))
+
+
+@pytest.mark.parametrize("words", [("train", "-m", "new", "-s"), ("inspect",), ("sfm", SCENE / "images")])
+def test_a_loop_of_links_gets_a_sentence(tmp_path, monkeypatch, fails, words):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "loop").symlink_to("loop")
+    assert "loop" in fails(*words, "loop")

@@ -173,6 +173,7 @@ def test_first_step_loads_only_what_it_needs():
     [
         (("-m", str(SCENE)), ("another folder than the scene's",)),
         (("-m", str(SCENE / "images" / "model")), ("another folder than the scene's or its images'",)),
+        (("-m", str(SCENE / "sparse" / "0")), ("another folder than the scene's or its images'",)),
         (("--config", "/no/such/file"), ("/no/such/file", "TOML", "(No such file or directory)")),
         (("--device", "cpu", "--data_device", "cuda"), ("--data_device cuda", "GPU")),
         (("--start_checkpoint", "x.pth"), ("x.pth", "can run code")),

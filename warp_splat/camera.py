@@ -61,8 +61,7 @@ class Camera:
     def __post_init__(self):
         for name in (*NUMBERS, "rotation", "translation"):
             if getattr(getattr(self, name), "requires_grad", False):  # it would get none
-                found = "found a tensor that wants a gradient; detach it, or use warp_splat.CameraParameters"
-                raise InputError(f"Camera {name}: expected numbers, {found}.")
+                raise InputError(f"Camera {name}: expected numbers, got a tensor that wants a gradient; detach it.")
         for name, (expected, fits, kind) in NUMBERS.items():
             try:
                 value = float(getattr(self, name))

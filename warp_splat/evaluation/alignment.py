@@ -16,19 +16,16 @@ from warp_splat.scene.types import View
 
 LEVELS = (1, 2, 4, 8, 16)  # px: boxes over which differences are averaged; fine detail sees no large displacement
 FARTHEST = 0.25  # rad about an axis, shares of the extent along one: a model that shows nothing leads nowhere
+Finish = Callable[[torch.Tensor, str], torch.Tensor]
 STEPS = 40  # pictures and their adjoints, about: an iteration that has begun is ended
 
 
 def where_taken(
-    gaussians: Gaussians,
-    background: torch.Tensor,
-    options: RasterOptions,
-    extent: float,
-    finish: Callable[[torch.Tensor, str], torch.Tensor],
+    gaussians: Gaussians, background: torch.Tensor, options: RasterOptions, extent: float, finish: Finish
 ) -> Callable[[View], Camera]:
     """A function from a view to the camera that :func:`find_pose` finds for it.
 
-    ``finish``: an image as the photograph of a name shows it.
+    ``finish``: what makes an image [H, W, 3] as a photograph shows it, by its name.
     """
     gaussians = Gaussians(*(tensor.detach() for tensor in gaussians))
     draw = lambda camera, name: finish(render(gaussians, camera, background, options).image, name)  # noqa: E731

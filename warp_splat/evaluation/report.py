@@ -19,6 +19,7 @@ import numpy as np
 
 from warp_splat.errors import InputError
 from warp_splat.formats.files import atomic_write
+from warp_splat.runtime.interrupts import later
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -176,7 +177,8 @@ def _smooth(values: np.ndarray) -> np.ndarray:
 
 def new_figure(width: float, height: float, layout: Literal["constrained", "compressed"] | None = None) -> Figure:
     """An empty figure in inches that belongs to no pyplot state and needs no display."""
-    from matplotlib.figure import Figure  # noqa: PLC0415 - half a second, only for pictures
+    with later():
+        from matplotlib.figure import Figure  # noqa: PLC0415 - half a second, only for pictures
 
     warnings.filterwarnings("ignore", "Glyph", UserWarning)  # of letters in names that the font has not
     return Figure(figsize=(width, height), dpi=DPI, layout=layout, facecolor="white")

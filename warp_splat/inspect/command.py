@@ -1,5 +1,6 @@
 """``warp-splat inspect``: all checks, a line for each finding, a page with pictures."""
 
+import os
 import sys
 import time
 from collections import Counter
@@ -25,7 +26,7 @@ def inspect(config: InspectConfig) -> int:
     """
     started = time.perf_counter()
     source = Path(config.scene)
-    page = Path(config.out or Path("output") / "inspect" / f"{source.resolve().name}.html")
+    page = Path(config.out or Path("output") / "inspect" / f"{os.path.basename(os.path.realpath(source))}.html")
     check_output(page, endings=(".html", ".htm"))
     if not has_cameras(source):
         if source.is_dir() and not (source / "point_cloud").is_dir():

@@ -30,6 +30,7 @@ from warp_splat.rendering.camera_paths import ORBIT_LENS, focus_orbit, origin_or
 from warp_splat.rendering.finished import Finished, as_photographed
 from warp_splat.rendering.popping import popping_of
 from warp_splat.runtime.devices import memory_explained
+from warp_splat.runtime.interrupts import later
 from warp_splat.scene.types import Scene, View
 from warp_splat.text import upward
 
@@ -57,7 +58,8 @@ def write_maps(name: str, find: Callable[[Camera], torch.Tensor], views: list[Vi
 
 def save_scaled(path: Path, values: np.ndarray) -> None:
     """Positive ``values`` [H, W] as colors, with the scale beside them."""
-    from matplotlib.figure import Figure  # noqa: PLC0415 - slow to load, only for these
+    with later():
+        from matplotlib.figure import Figure  # noqa: PLC0415 - slow to load, only for these
 
     height, width = values.shape
     figure = Figure(figsize=(width / DPI + 1.0, height / DPI), dpi=DPI)
@@ -145,9 +147,8 @@ def render_model(config: RenderConfig) -> int:
                 certify(train, written)
             if test:
                 extra = {"split": "test", "gaussians": len(model)}
-                seen = activated, finished.background(device), options, given.extent
-                finish = partial(as_photographed, finished.exposures)
-                where = where_taken(*seen, finish) if scene is not given else None
+                finish, behind = partial(as_photographed, finished.exposures), finished.background(device)
+                where = where_taken(activated, behind, options, given.extent, finish) if scene is not given else None
                 means, compared = evaluate_views(picture, test, folder, "test", iteration, extra, metrics, where)
                 show_views(compared, folder, "test", iteration, say)
                 print(f"  test   {len(test)} views in {folder / 'test' / f'ours_{iteration}'}")

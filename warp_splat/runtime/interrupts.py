@@ -30,6 +30,15 @@ def interruptible() -> Iterator[list[int]]:
         yield interrupted
 
 
+@contextmanager
+def later() -> Iterator[None]:
+    """Let Ctrl-C and SIGTERM come after the block: in libraries that are half loaded, exceptions become others."""
+    with interruptible() as interrupted:
+        yield
+    for number in interrupted:  # for the handler of whoever loads them
+        signal.raise_signal(number)
+
+
 def ending_as_by_ctrl_c() -> AbstractContextManager[None]:
     """Let SIGTERM raise as Ctrl-C does, so that what is half written goes, and what is measured is kept.
 

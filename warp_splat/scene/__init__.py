@@ -81,10 +81,8 @@ def load_scene(
         train, test = _hold_out(train, source)
         report(f"Holding out every {HOLD_OUT}th image by name: {len(train)} images train, {len(test)} test.")
     elif both := sorted({photo.path for photo in train} & {photo.path for photo in test}):
-        raise InputError(
-            f"{source}: expected to test on photographs that do not train, found {len(both)} in both lists, such as "
-            f"{both[0].name}; take them out of one, or leave out --eval."
-        )
+        found = f"found {len(both)} in both lists, such as {both[0].name}"
+        raise InputError(f"{source}: expected tests on photographs that do not train, {found}; leave out --eval.")
     from warp_splat.scene.blocks import block_of  # noqa: PLC0415  keeps `import warp_splat` light
     from warp_splat.scene.colmap import read_tracks  # noqa: PLC0415  keeps `import warp_splat` light
     from warp_splat.scene.decoding import load_views  # noqa: PLC0415

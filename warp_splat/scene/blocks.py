@@ -132,8 +132,7 @@ def merge_blocks(config: MergeConfig) -> int:
     for place, block, options in zip(places, blocks, trained, strict=True):
         origin = (read_coordinates(place) or {}).get("origin")
         cells = {"number of blocks": len(block.cells), "cells": block.cells.tolist(), "origin": origin}
-        light = {"linear_light": bool(options.get("linear_light"))}
-        kinds.append({**cells, **light, **{name: options.get(name) for name in COMMON}})
+        kinds.append({**cells, **{name: options.get(name) for name in (*COMMON, "linear_light")}})
         if other := [name for name, value in kinds[-1].items() if value != kinds[0][name]]:
             raise InputError(f"{place}: expected the {other[0]} of {places[0]}, found another; move one of them away.")
     numbers, count = [block.number for block in blocks], len(blocks[0].cells)

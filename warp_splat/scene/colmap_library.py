@@ -1,20 +1,16 @@
 """pycolmap where it is installed, else None: it has no wheel for Linux on ARM."""
 
-import signal
-
 import OpenImageIO  # noqa: F401 - before pycolmap: after it, whose libraries clash with its own, writing a PNG crashes
 
 from warp_splat.errors import InputError
-from warp_splat.runtime.interrupts import interruptible
+from warp_splat.runtime.interrupts import later
 
 # Ctrl-C while it loads would become its RuntimeError. Of SIGTERM it takes care itself, and prints a stack of C++.
-with interruptible() as interrupted:
+with later():
     try:
         import pycolmap
     except ImportError:
         pycolmap = None  # type: ignore
-for number in interrupted:  # for the handler of whoever loads this
-    signal.raise_signal(number)
 
 
 def require_pycolmap(what: str) -> None:

@@ -90,10 +90,9 @@ def _read(path: Path, view: View, scale: float, offset: float) -> np.ndarray:
     require_shape(path, "map", numbers.shape[::-1], file, "make it from the photograph")
     rows, columns = nearest_of(height, numbers.shape[0]), nearest_of(width, numbers.shape[1])
     picked = numbers[rows[:, None], columns]
-    with np.errstate(over="ignore"):
-        found = (np.where(picked < 0.0, np.nan, picked) * scale + offset).astype(np.float32)
-    known = np.isfinite(found) & (found >= 0.0) & (True if (mask := view.mask) is None else mask > 0)
-    return np.where(known, found, np.float32(-1.0))
+    found = np.where(picked < 0.0, np.nan, picked) * scale + offset
+    known = (found >= 0.0) & (found < 1e30) & (True if (mask := view.mask) is None else mask > 0)
+    return np.where(known, found, -1.0).astype(np.float32)
 
 
 def nearest_of(count: int, size: int) -> np.ndarray:

@@ -113,8 +113,11 @@ def read_exposure(path: Path) -> float | None:
 
 
 def same_shape(size: tuple[int, int], other: tuple[int, int]) -> bool:
-    """Whether one size is the other times a factor, up to the rounding of either side to whole pixels."""
-    return abs(size[0] * other[1] - size[1] * other[0]) < other[0] + other[1]
+    """Whether one size is the other times a factor, up to the rounding of either side to whole pixels.
+
+    No size is below a 64th of the ``other``: rounded to a pixel or two, all are alike.
+    """
+    return abs(size[0] * other[1] - size[1] * other[0]) < other[0] + other[1] <= 64 * sum(size)
 
 
 def require_shape(path: Path, kind: str, found: tuple[int, ...], size: tuple[int, int], advice: str) -> None:

@@ -24,7 +24,8 @@ def find_files(root: Path, endings: tuple[str, ...], without: Path | None = None
 
     Hidden files and folders are left out, and all that lies in trained models and in the folder ``without``.
     """
-    others = {path.parent.resolve() for path in root.rglob("*/cfg_args")} | ({without.resolve()} if without else set())
+    places = (without, *(path.parent for path in root.rglob("*/cfg_args")))
+    others = {Path(os.path.realpath(place)) for place in places if place}
     names = (
         path.relative_to(root)
         for path in root.rglob("*")

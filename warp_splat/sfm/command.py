@@ -114,11 +114,11 @@ def _claim(source: Path, scene: Path, config: SfmConfig) -> Path:
     """The folder of the work in ``scene``, which is new, or was begun on the same input with the same options."""
     work, options = scene / WORK, {name: getattr(config, name) for name in ("frames", "matching", "seed")}
     options |= {"keep_lens": True} if config.keep_lens else {}
-    if source.resolve() == scene.resolve():
+    if os.path.realpath(source) == os.path.realpath(scene):
         raise InputError(f"{scene}: expected another folder than that of the photographs for the scene; choose one.")
     if source.is_dir():
         root = photo_root(source)
-        if scene.resolve() in (root.resolve(), *root.resolve().parents):
+        if Path(os.path.realpath(scene)) in (root.resolve(), *root.resolve().parents):
             raise InputError(
                 f"{scene}: expected a folder for the scene that does not hold the photographs, since its images/ would "
                 f"be written over; choose another, such as {scene_of(scene)}."

@@ -16,7 +16,7 @@ from warp_splat.kernels.compiler import PORTABLE
 from warp_splat.raster.selftest import settle_device
 from warp_splat.runtime import pool
 from warp_splat.runtime.distributed import Processes
-from warp_splat.scene import load_scene
+from warp_splat.scene import MASKS, load_scene
 from warp_splat.scene.blocks import BLOCK, COMMON
 from warp_splat.scene.decoding import photo_memory
 from warp_splat.scene.embedded import embedded_scene
@@ -92,8 +92,9 @@ def check_folder(config: TrainConfig, folder: Path) -> None:
     """Raise InputError if a training may not write there, whatever the folder holds."""
     model_folder.check_place(folder)
     if source := config.data.source_path:
-        place, scene, photos = (path.resolve() for path in (folder, Path(source), Path(source, config.data.images)))
-        if place == scene or (photos != scene and place.is_relative_to(photos)):
+        place, scene = (Path(os.path.realpath(path)) for path in (folder, source))  # resolve() fails at loops of links
+        own = {Path(os.path.realpath(scene / name)) for name in (config.data.images, "sparse", MASKS)} - {scene}
+        if place == scene or any(map(place.is_relative_to, own)):
             raise InputError(f"-m {folder}: expected another folder than the scene's or its images'; choose a new one.")
 
 
