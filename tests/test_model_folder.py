@@ -12,7 +12,7 @@ from commands import full_disk, started
 from hostile import refusal
 from scene_files import write_colmap
 from scipy.spatial.transform import Rotation
-from splat_files import some_file, some_splats
+from splat_files import some_splats
 
 from warp_splat.camera import Camera
 from warp_splat.errors import InputError
@@ -251,17 +251,3 @@ def test_open_model(tmp_path, mark, monkeypatch, fails, ran):
     message = fails("render", "-m", folder)
     assert "cfg_args: expected a projection of affine, ellipsoid, unscented, found 'fisheye'" in message
     assert drawn[1].linear and drawn[1].coordinates["origin"] == [1.0, 2.0, 3.0] and drawn[2]["linear_light"]
-
-
-@pytest.mark.parametrize(
-    ("options", "sentence"),
-    [
-        ("--orbit --bound", "--bound: expected views"),
-        ("--video path --orbit_center origin", "--orbit_center origin: expected --orbit or --video orbit"),
-        ("--device cpu", "name the scene with -s"),
-        ("--iteration 7", "expected a model folder for iteration 7, found a file"),
-    ],
-)
-def test_what_render_makes_of_a_file_alone(tmp_path, fails, options, sentence):
-    save_gaussians(tmp_path / "a.spz", some_file(100))
-    assert sentence in fails("render", "-m", tmp_path / "a.spz", *options.split())

@@ -49,27 +49,21 @@ def test_every_option_survives_the_file(tmp_path):
         ("--parts random_background,weather", f"--parts: expected auto, or some of {', '.join(PARTS)} between commas"),
         ("--port 0", "--port: expected 1 to 65535, got 0."),
         ("--lambda_dssim 1.5", "--lambda_dssim: expected a finite number, 0 to 1, got 1.5."),
-        ("--opacity_lr nan", "--opacity_lr: expected a finite number, at least 0, got nan."),
         ("--opacity_lr inf", "--opacity_lr: expected a finite number, at least 0, got inf."),
         ("--save_iterations 5 0", "--save_iterations: expected numbers of steps, at least 1, got 0."),
         ("--iterations 0", "--iterations: expected 1 to 2147483647, got 0."),
-        ("--viewer --port 70000", "--port: expected 1 to 65535"),
         ("--disable_viewer", "unless --viewer asks"),
         ("view model --host 0.0.0.0", "--host: the viewer is served to this machine only"),
         ("audit x --command p --limit 0", "--limit: expected a finite number, at least 0.1, got 0.0."),
         ("merge no/such", "no/such: expected only folders of ended trainings by --block, found no such folder"),
         ("--minutes 0", "--minutes: expected more than 0, got 0; leave it out to train by --iterations."),
-        ("--minutes -2", "--minutes: expected more than 0, got -2"),
         ("--minutes nan", "--minutes: expected more than 0, got nan"),
         ("--minutes inf", "--minutes: expected a finite number"),
         ("--minutes 3 --iterations 100", "--minutes: expected no --iterations beside it, since it plans the steps"),
         ("--minutes 3 --densify_until_iter 100", "--minutes: expected no --densify_until_iter beside it"),
         ("--depth_l1_weight_final=0 --parts depth", "--depth_l1_weight_final: expected a positive number"),
         ("--pose_lr=-1", "--pose_lr: expected"),
-        ("--pose_lr=nan", "--pose_lr: expected"),
-        ("--opacity_reg=-1", "--opacity_reg: expected a finite number, at least 0, got -1.0."),
         ("--opacity_reg=nan", "--opacity_reg: expected a finite number, at least 0, got nan."),
-        ("--opacity_reg=inf", "--opacity_reg: expected a finite number, at least 0, got inf."),
         ("view model --port 65536", "--port: expected 1 to 65535, got 65536."),
         ("render -m model --threads -1", "--threads: expected at least 0, got -1."),
         ("sfm photos scene --frames 2", "--frames: expected at least 3, got 2."),
@@ -110,10 +104,6 @@ def test_a_file_may_begin_with_the_mark_of_its_order_of_bytes(tmp_path):
     assert read_config(tmp_path / "a.toml") == {"iterations": 3}
 
 
-def test_no_file():
-    refusal(lambda: read_config("none.toml"), "No such file")
-
-
 def test_help_begins_with_the_flags_that_matter(capsys):
     with pytest.raises(SystemExit):
         make_parser().parse_args(["train", "--help"])
@@ -150,9 +140,9 @@ def test_flags_go_before_the_preset_and_the_preset_before_defaults():
     assert embedded.learn.iterations == EMBEDDED_DEFAULTS["fast"]["iterations"]
 
 
-@pytest.mark.parametrize("words", ["train -s", "train -m", "train --resume", "train --config", "simplify x -o"])
-def test_empty_paths_are_refused(words):
-    refusal(lambda: parse([*words.split(), ""]), "an empty one")
+@pytest.mark.parametrize("flag", ["-s", "-m", "--resume", "--config", "--start_ply", "--lpips_weights", "-o"])
+def test_empty_paths_are_refused(flag):
+    refusal(lambda: parse([*(["simplify", "x"] if flag == "-o" else ["train"]), flag, ""]), "a path", "an empty one")
 
 
 def test_presets_are_made_of_documented_flags():

@@ -22,7 +22,7 @@ from hostile import refusal
 from scene_files import texture, write_blender, write_image
 from scipy.ndimage import gaussian_filter
 
-from warp_splat.cli import main, parse
+from warp_splat.cli import main
 from warp_splat.config import SfmConfig
 from warp_splat.formats.png import save_video
 from warp_splat.scene import load_scene
@@ -293,7 +293,6 @@ def test_a_folder_in_use_stays_as_it_is(photos, scene, tmp_path):
         words = "does not hold the photographs", "written over", f"{tmp_path / target}_scene"
         config = SfmConfig(str(tmp_path / source), str(tmp_path / target))
         refusal(partial(sfm, config), *words)
-    refusal(lambda: parse(["sfm", str(photos[0]), str(tmp_path / "x"), "--frames", "2"]), "--frames")
 
 
 def test_photographs_of_one_size_that_were_exchanged_are_others(tmp_path):

@@ -13,7 +13,6 @@ from hostile import refusal
 from scene_files import write_colmap
 from splat_files import small_splats
 
-from warp_splat.cli import parse
 from warp_splat.color import to_srgb
 from warp_splat.config import RasterOptions, ViewConfig
 from warp_splat.errors import InputError
@@ -228,22 +227,6 @@ def test_small_models(fake_viser, count, coefficients):
             viewer.watchers[1].kind.value = kind
             assert drawn(viewer) == 1
         assert len(client.frames) == 3
-
-
-@pytest.mark.parametrize(
-    ("config", "message"),
-    [
-        (ViewConfig(), "MODEL: expected the folder"),
-        (ViewConfig("no/such/folder"), "found no such folder"),
-        (ViewConfig("no/such.ply"), "no/such.ply"),
-    ],
-)
-def test_what_cannot_be_viewed(config, message):
-    refusal(lambda: view_model(config), match=message)
-
-
-def test_no_port_that_there_is_not():
-    refusal(lambda: parse(["view", "no/such.ply", "--port", "0"]), match="--port: expected")
 
 
 @pytest.mark.parametrize(("source", "tolerance"), [("", 0.0), ("scene", 0.0), ("", 0.5)])
