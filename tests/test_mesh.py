@@ -145,13 +145,10 @@ def test_nothing_to_go_by():
 
 
 @pytest.mark.slow
-def test_any_number_of_threads(threads):
+def test_any_number_of_threads(same_by_threads):
     views, (wrong, photographs, _) = [ball(index) for index in range(4)], patterned()
-    found = []
-    for count in (1, 3):
-        threads(count)
-        found.append([*surface(agreed(views)), *(view.depth for view in filled(wrong, agreed(wrong), photographs))])
-    torch.testing.assert_close(*found, rtol=0, atol=0)
+    same_by_threads(lambda: surface(agreed(views)))
+    same_by_threads(lambda: [view.depth for view in filled(wrong, agreed(wrong), photographs)])
 
 
 def test_depths_that_others_do_not_see():
@@ -178,17 +175,14 @@ def closed(views):
 
 
 @pytest.mark.parametrize("seen", [[0], [0, 5, 10, 15]])
-def test_holes_are_closed(threads, seen):
+def test_holes_are_closed(same_by_threads, seen):
     """What is seen stays where it was, and has an inside, in box and color as well; for any number of threads."""
-    views, found = [ball(index) for index in seen], []
-    for count in (1, 2):
-        threads(count)
-        found.append(closed(views))
-    np.testing.assert_equal(*found)
-    mesh, opened = (trimesh.Trimesh(*each[:2], process=False) for each in (found[0], surface(views)))
+    views = [ball(index) for index in seen]
+    found = [array.numpy() for array in same_by_threads(lambda: closed(views))]
+    mesh, opened = (trimesh.Trimesh(*each[:2], process=False) for each in (found, surface(views)))
     assert mesh.is_watertight and not opened.is_watertight and mesh.volume > 4
     assert trimesh.proximity.ProximityQuery(mesh).vertex(opened.vertices)[0].max() < VOXEL
-    np.testing.assert_allclose(found[0].colors, np.float32([[0.2, 0.5, 0.8]]).repeat(len(mesh.vertices), 0), atol=1e-5)
+    np.testing.assert_allclose(found[2], np.float32([[0.2, 0.5, 0.8]]).repeat(len(mesh.vertices), 0), atol=1e-5)
 
 
 def test_a_wrong_depth_bores_into_nothing_solid():
