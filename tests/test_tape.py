@@ -15,7 +15,7 @@ from scenes import SCENES, cloud, make_camera
 import warp_splat
 from warp_splat import CameraParameters, InputError, RasterOptions, tape
 from warp_splat.config import ADJOINTS
-from warp_splat.raster.drivers import CUDA
+from warp_splat.raster.drivers import CPU, CUDA
 
 KINDS = {"means": wp.vec3, "quats": wp.vec4, "scales": wp.vec3, "opacities": wp.float32, "sh": wp.vec3}
 TWIST = [0.01, -0.02, 0.015, 0.05, -0.03, 0.02]
@@ -79,31 +79,23 @@ def on_tape(device, mode="manual", options=None, requires_grad=True):
     with wp.Tape() as recorded:
         means = wp.empty_like(arrays[0], requires_grad=True)
         wp.launch(twice, len(means), [arrays[0], means], device=device)
-        out = tape.rasterize(
-            means, *arrays[1:5], scene.camera, arrays[5], mode, options, twist=arrays[6], intrinsics=arrays[7]
-        )
+        learned = {"twist": arrays[6], "intrinsics": arrays[7]}
+        out = tape.rasterize(means, *arrays[1:5], scene.camera, arrays[5], mode, options, **learned)
         weights = wp.from_torch(weights, wp.vec4)
         wp.launch(weigh, out.image.shape, [out.image, out.alpha, weights, loss], device=device)
     assert len(recorded.launches) == 3
     return recorded, loss, arrays, out
 
 
-@pytest.mark.parametrize("mode", ADJOINTS)
-def test_the_bits_are_those_of_torch(mode, device):
+@pytest.mark.parametrize(("mode", "driver"), [*((mode, CPU) for mode in ADJOINTS), ("manual", CUDA)])
+def test_the_bits_are_those_of_torch(mode, driver, device):
     options = RasterOptions(depth=True, antialiasing=True)
-    expected, gradients = by_torch(device, mode, options)
-    recorded, loss, arrays, out = on_tape(device, mode, options)
+    with using(driver):
+        expected, gradients = by_torch(device, mode, options)
+        recorded, loss, arrays, out = on_tape(device, mode, options)
+        recorded.backward(loss)
     assert torch.equal(wp.to_torch(out.image), expected.image) and torch.equal(wp.to_torch(out.alpha), expected.alpha)
     assert torch.equal(wp.to_torch(out.depth), expected.depth) and torch.equal(wp.to_torch(out.radii), expected.radii)
-    recorded.backward(loss)
-    assert all(torch.equal(wp.to_torch(array.grad), grad) for array, grad in zip(arrays, gradients, strict=True))
-
-
-def test_cuda_kernels_give_the_bits_of_torch_as_well():
-    with using(CUDA):
-        _, gradients = by_torch("cpu")
-        recorded, loss, arrays, _ = on_tape("cpu")
-        recorded.backward(loss)
     assert all(torch.equal(wp.to_torch(array.grad), grad) for array, grad in zip(arrays, gradients, strict=True))
 
 
@@ -249,19 +241,17 @@ def test_worlds_of_another_number_than_cameras_are_refused(name, device):
     if name == "means":
         arrays[name] = wp.from_torch(torch.stack([scene.means] * 3), wp.vec3)
     out = {"image": wp.zeros(shape, dtype=wp.vec3, device=device)} if name == "image" else None
-    given = [arrays[each] for each in ("means", "quats", "scales", "opacities", "sh")]
     with pytest.raises(InputError, match=f"{name}: expected one array for each of 2 cameras, got 3"):
-        tape.rasterize_worlds(*given, cameras=[scene.camera] * 2, out=out)
+        tape.rasterize_worlds(**arrays, cameras=[scene.camera] * 2, out=out)
 
 
 def test_worlds_share_features_and_write_into_one_array(device):
     scene, *_ = scene_of(device)
     features, twists = torch.rand(len(scene.means), 2, device=device), wp.zeros(2, wp.spatial_vector, device=device)
     shown = wp.zeros((2, scene.camera.height, scene.camera.width, 2), dtype=float, device=device)
-    given = [arrays_of(scene)[name] for name in ("means", "quats", "scales", "opacities", "sh")]
     cameras = [scene.camera, make_camera(scene.camera.width, scene.camera.height, seed=3)]
     more = {"features": wp.from_torch(features), "twist": twists, "out": {"features": shown}}
-    tape.rasterize_worlds(*given[:4], sh=given[4], cameras=cameras, **more)
+    tape.rasterize_worlds(**arrays_of(scene), cameras=cameras, **more)
     for camera, found in zip(cameras, wp.to_torch(shown), strict=True):
         assert torch.equal(found, warp_splat.rasterize(*scene.parameters(), camera, features=features).features)
 
@@ -269,8 +259,7 @@ def test_worlds_share_features_and_write_into_one_array(device):
 def test_worlds_are_separate_calls_into_one_array(device):
     """Two worlds of their own means, the rest in common, each with its camera; and no new arrays for the pictures."""
     scene, _, weights = scene_of(device)
-    arrays = arrays_of(scene)
-    both = torch.stack([scene.means, scene.means + 0.05])
+    arrays, both = arrays_of(scene), torch.stack([scene.means, scene.means + 0.05])
     means = wp.from_torch(both, wp.vec3, requires_grad=True)
     cameras = [scene.camera, make_camera(scene.camera.width, scene.camera.height, seed=3)]
     shape = (2, scene.camera.height, scene.camera.width)
@@ -278,11 +267,9 @@ def test_worlds_are_separate_calls_into_one_array(device):
     alphas = wp.zeros(shape, dtype=float, device=device, requires_grad=True)
     surface = torch.full(shape, float(scene.means.norm(dim=1).median()), device=device)
     surface[1] = 0.0  # no surface
-    given = [means, *(arrays[name] for name in ("quats", "scales", "opacities", "sh"))]
+    given = {**arrays, "means": means, "out": {"image": images, "alpha": alphas}}
     with wp.Tape() as recorded:
-        found = tape.rasterize_worlds(
-            *given, cameras=cameras, hidden_from=wp.from_torch(surface), out={"image": images, "alpha": alphas}
-        )
+        found = tape.rasterize_worlds(**given, cameras=cameras, hidden_from=wp.from_torch(surface))
     recorded.backward(grads={images: wp.from_torch(weights[..., :3].expand(2, -1, -1, -1).contiguous(), wp.vec3)})
     for world, camera in enumerate(cameras):
         leaf = both[world].clone().requires_grad_()
@@ -294,7 +281,7 @@ def test_worlds_are_separate_calls_into_one_array(device):
         assert torch.equal(wp.to_torch(means.grad)[world], leaf.grad)
     with pytest.raises(InputError, match="options: expected"):
         tape.rasterize(*arrays.values(), scene.camera, options={}, hidden_from=wp.from_torch(surface[0]))
-    refusal(lambda: tape.rasterize_worlds(*given, cameras=scene.camera), match="cameras: expected a sequence")
+    refusal(lambda: tape.rasterize_worlds(**given, cameras=scene.camera), match="cameras: expected a sequence")
     refusal(lambda: tape.rasterize(*arrays.values(), scene.camera, out=images), match="got 'array'")
     wrong = {"image": r"out\['image'\]: expected .* got \[3, 3, 3\]", "depth": "some of image, alpha, got 'depth'"}
     for name, sentence in wrong.items():
