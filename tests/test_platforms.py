@@ -189,7 +189,3 @@ def test_what_needs_it_is_refused_by_name(make, run, words, tmp_path, missing):
 def test_inspect_tells_it(tmp_path, missing):
     _, findings = read_subject(write_colmap(tmp_path), "images")
     assert ["pycolmap" in finding.text for finding in findings if finding.level == "error"] == [True]
-
-
-def test_transforms_with_pinholes_are_read(tmp_path, missing):
-    assert len(load_scene(write_transforms(tmp_path), report=str).train) == 2

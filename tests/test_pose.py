@@ -269,9 +269,9 @@ def test_a_scene_that_changed_is_refused(trained, tmp_path, fails):
     assert "expected a refined camera for" in message and "found none; the scene has changed" in message
 
 
-def test_without_it_nothing_changes(scene, tmp_path):
+def test_options_of_parts_that_are_not_used_change_nothing(scene, tmp_path):
     states = []
-    for options in ({}, {"pose_lr": 9.0, "pose_reg": 9.0, "pose_intrinsics": "all"}):
+    for options in ({}, {"pose_lr": 9.0, "pose_reg": 9.0, "pose_intrinsics": "all", "opacity_reg": 9.0}):
         trainer, run = stepped(scene, tmp_path, 12, **options)
         states.append(state_of(trainer, run)[0])
         assert trainer.refined(scene.train) is scene.train and trainer.where_taken() is None
