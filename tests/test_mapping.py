@@ -93,9 +93,8 @@ def test_matches_tell_a_model_that_is_torn(truth):
     assert every.sum() == sum(fitting(database).values()) and (fit == every).all()
     fit, every = mapping.matches_that_fit(torn(model, (1.0, 2.0, 0.0)), database)
     half = COUNT // 2
-    assert (
-        np.count_nonzero(fit == every) - 1 == half * (half - 1) and 10 * np.count_nonzero(2 * fit < every) > 9 * half**2
-    )
+    assert np.count_nonzero(fit == every) - 1 == half * (half - 1)
+    assert 10 * np.count_nonzero(2 * fit < every) > 9 * half**2
 
 
 def test_what_hardly_anything_holds_together_is_no_part_of_a_model(truth):
@@ -118,9 +117,8 @@ def test_pairs_that_may_fit_by_chance_are_left_out(tmp_path):
         images = [connection.write_image(pycolmap.Image(f"{k}.jpg", camera_id=camera)) for k in range(7)]
         for pair in (*sure, *doubtful):
             count = mapping.SURE - (pair in doubtful)
-            geometry = pycolmap.TwoViewGeometry(
-                config=2, inlier_matches=np.repeat(np.arange(count)[:, None], 2, axis=1)
-            )
+            matches = np.repeat(np.arange(count)[:, None], 2, axis=1)
+            geometry = pycolmap.TwoViewGeometry(config=2, inlier_matches=matches)
             connection.write_two_view_geometry(images[pair[0]], images[pair[1]], geometry)
     mapping.leave_out_doubtful(tmp_path / "database.db")
     left = {(images.index(a), images.index(b)) for a, b in fitting(tmp_path / "database.db")}

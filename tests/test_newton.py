@@ -13,7 +13,7 @@ from scenes import C0
 from scipy.spatial.transform import Rotation
 from simulations import BACKGROUND, BODIES, CAMERAS, FOV, HEIGHT, PLACE, UNSEEN, WIDTH, images, newton, state_of
 
-from warp_splat import Camera, InputError, Lens, RasterOptions, Shutter
+from warp_splat import InputError, Lens, RasterOptions, Shutter
 from warp_splat.compare.oracle import sh_basis
 from warp_splat.formats.splats import concatenated
 from warp_splat.newton import SensorSplatCamera, camera_of_fov
@@ -45,10 +45,8 @@ def seen_exactly(parts, body, camera_transform, lens=None, shutter=None, **cuts)
     both = [parts[0], moved(moved(parts[1], PLACE, 1.5), body)]
     means, sh, opacities, scales, quats = (torch.from_numpy(array).double() for array in concatenated(both))
     turn = np.diag([1.0, -1, -1]) @ Rotation.from_quat(camera_transform[3:]).as_matrix().T
-    fov = camera_of_fov(WIDTH, HEIGHT, FOV)
-    camera = Camera(
-        WIDTH, HEIGHT, fov.fx, fov.fy, fov.cx, fov.cy, turn, -turn @ np.array(camera_transform[:3]), lens, shutter
-    )
+    pose = {"rotation": turn, "translation": -turn @ np.array(camera_transform[:3])}
+    camera = replace(camera_of_fov(WIDTH, HEIGHT, FOV), **pose, lens=lens, shutter=shutter)
     return exact_render(means, quats, scales.exp(), opacities.sigmoid(), sh, camera, BACKGROUND, **cuts)
 
 
@@ -57,9 +55,8 @@ def test_pictures_are_those_of_the_float64_renderer(simulation):
     worlds = [1, 0, 0, 1]
     transforms = wp.array([CAMERAS[view % 2] for view in range(4)], dtype=wp.transform)
     made = images(4, rgb_image=wp.vec3, color_image=wp.uint32, forward_depth_image=float, shape_index_image=wp.uint32)
-    simulation.sensor.update(
-        state_of(simulation), transforms, camera_of_fov(WIDTH, HEIGHT, FOV), world_indices=worlds, **made
-    )
+    camera = camera_of_fov(WIDTH, HEIGHT, FOV)
+    simulation.sensor.update(state_of(simulation), transforms, camera, world_indices=worlds, **made)
     for view, world in enumerate(worlds):
         exact = seen_exactly(simulation.parts, BODIES[world], CAMERAS[view % 2])
         rgb = made["rgb_image"].numpy()[view]
@@ -221,31 +218,23 @@ def test_meshes_hide_splats_and_splats_hide_meshes():
     depths, opacities = (2.0, 3.0, 5.0), np.float32([0.4, 0.6, 0.9])
     colors = np.float32([[1, 0, 0], [0, 1, 0], [0, 0, 1]])
     builder = newton.ModelBuilder()
-    builder.add_shape_gaussian(
-        -1,
-        gaussian=newton.Gaussian(
-            [[0, 0, -z] for z in depths], None, [[900, 900, 1e-3]] * 3, opacities, (colors - 0.5) / C0
-        ),
-        cfg=UNSEEN,
-    )
+    means, scales = [[0, 0, -z] for z in depths], [[900, 900, 1e-3]] * 3
+    splats = newton.Gaussian(means, None, scales, opacities, (colors - 0.5) / C0)
+    builder.add_shape_gaussian(-1, gaussian=splats, cfg=UNSEEN)
     board = (0.6, 0.0, -3.2, *Rotation.from_rotvec([0, 0.9, 0]).as_quat())
     builder.add_shape_box(-1, xform=board, hx=1.2, hy=0.7, hz=0.01)
     model = builder.finalize(device="cpu")
     state, transforms = model.state(), wp.array([(0, 0, 0, 0, 0, 0, 1)], dtype=wp.transform)
-    theirs, rays = (
-        newton.sensors.SensorCamera(model),
-        newton.sensors.SensorCamera.compute_camera_rays_pinhole(WIDTH, HEIGHT, camera_fov=FOV),
-    )
+    theirs = newton.sensors.SensorCamera(model)
+    rays = theirs.compute_camera_rays_pinhole(WIDTH, HEIGHT, camera_fov=FOV)
     mesh = images(1, color_image=wp.uint32, forward_depth_image=float, shape_index_image=wp.uint32)
     theirs.update(state, transforms, rays, **mesh)
     color, depth = mesh["color_image"].numpy()[0], mesh["forward_depth_image"].numpy()[0].copy()
     color = color.view(np.uint8).reshape(HEIGHT, WIDTH, 4)[..., :3] / 255
     assert (depth == 0).any() and ((depth > 2) & (depth < 3)).any() and ((depth > 3) & (depth < 5)).any()
-    given = {"mesh_color": "color_image", "mesh_depth": "forward_depth_image", "mesh_index": "shape_index_image"}
+    given = dict(zip(("mesh_color", "mesh_depth", "mesh_index"), mesh.values(), strict=True))
     made = images(1, rgb_image=wp.vec3) | mesh  # their pictures are written over
-    SensorSplatCamera(model).update(
-        state, transforms, camera_of_fov(WIDTH, HEIGHT, FOV), **made, **{a: mesh[b] for a, b in given.items()}
-    )
+    SensorSplatCamera(model).update(state, transforms, camera_of_fov(WIDTH, HEIGHT, FOV), **made, **given)
     hit = depth > 0
     image, light, sum_z = np.zeros((HEIGHT, WIDTH, 3)), np.ones((HEIGHT, WIDTH)), np.zeros((HEIGHT, WIDTH))
     shares = []
@@ -256,6 +245,5 @@ def test_meshes_hide_splats_and_splats_hide_meshes():
     np.testing.assert_allclose(made["rgb_image"].numpy()[0], image + (light * hit)[..., None] * color, atol=3e-4)
     wanted = np.where(hit, sum_z + light * depth, sum_z / np.maximum(1 - light, 1e-9))
     np.testing.assert_allclose(made["forward_depth_image"].numpy()[0], wanted, rtol=1e-3)
-    np.testing.assert_array_equal(
-        made["shape_index_image"].numpy()[0], np.where(hit & (light > np.max(shares, 0)), 1, 0)
-    )
+    on_mesh = hit & (light > np.max(shares, 0))
+    np.testing.assert_array_equal(made["shape_index_image"].numpy()[0], np.where(on_mesh, 1, 0))
