@@ -39,10 +39,14 @@ def view(name="0001.jpg", height=60, width=80, gap=8):
     return name, photo, photo + np.uint8(gap), "30.00 dB"
 
 
+def sheet_of(folder, sections, name="sheet.png", **options):
+    report.contact_sheet(folder / name, sections, **options)
+    return load_png(folder / name)
+
+
 @pytest.mark.parametrize(("count", "columns"), [(1, 1), (3, 1), (5, 2), (7, 3), (2, 4)])
 def test_contact_sheet_size(tmp_path, count, columns):
-    report.contact_sheet(tmp_path / "sheet.png", {"": [view() for _ in range(count)]}, columns=columns)
-    sheet = load_png(tmp_path / "sheet.png")
+    sheet = sheet_of(tmp_path, {"": [view()] * count}, columns=columns)
     assert sheet.shape[1] == 1600
     lines = -(-count // columns)
     cell_height = 1600 / (3 * columns) * 60 / 80
@@ -52,16 +56,14 @@ def test_contact_sheet_size(tmp_path, count, columns):
 @pytest.mark.parametrize(("height", "width"), [(40, 1), (1, 40)])
 def test_contact_sheet_of_strips_stays_small(tmp_path, height, width):
     """At the width of its cell, each would be 21,000 pixels high; a strip of 5,000 pixels took all memory."""
-    report.contact_sheet(tmp_path / "sheet.png", {"": [view(height=height, width=width)] * 2})
-    assert load_png(tmp_path / "sheet.png").shape[0] < 5000
+    assert sheet_of(tmp_path, {"": [view(height=height, width=width)] * 2}).shape[0] < 5000
 
 
 def test_contact_sheet_shows_the_amplified_difference(tmp_path):
     name, photo, _, said = view()
     render = photo.copy()
     render[:, :40] = 255
-    report.contact_sheet(tmp_path / "sheet.png", {"": [(name, photo, render, said)]})
-    sheet = load_png(tmp_path / "sheet.png").astype(int)
+    sheet = sheet_of(tmp_path, {"": [(name, photo, render, said)]}).astype(int)
     middle = sheet[sheet.shape[0] // 2]
     photo_at, render_left, render_right, difference_left, difference_right = middle[[250, 600, 950, 1150, 1450]]
     assert photo_at.sum() == 0 and render_left.sum() == 765 and render_right.sum() == 0
@@ -73,8 +75,8 @@ def test_scale_of_a_sheet_has_the_colors_of_its_errors(tmp_path):
     photo = np.zeros((60, 90, 3), np.uint8)
     render = photo.copy()
     render[:, 30:60], render[:, 60:] = 32, 64
-    report.contact_sheet(tmp_path / "sheet.png", {"a": [("", photo, render, "")], "b": [("", photo, render, "")]})
-    sheet = load_png(tmp_path / "sheet.png").astype(int)
+    rows = [("", photo, render, "")]
+    sheet = sheet_of(tmp_path, {"a": rows, "b": rows}).astype(int)
     heading = sheet[15:40, 1000:]
     row, left, right = next(
         (line, columns[0], columns[-1])
@@ -85,15 +87,13 @@ def test_scale_of_a_sheet_has_the_colors_of_its_errors(tmp_path):
     assert np.abs(row[left - 20] - error[0]).max() < 8 and np.abs(row[right - 1] - error[2]).max() < 8
     halfway = np.abs(row[left:right] - error[1]).max(axis=1)
     assert 0.4 < np.argmin(halfway) / (right - left) < 0.6 and halfway.min() < 12
-    report.contact_sheet(tmp_path / "one.png", {"a": [("", photo, render, ""), ("", photo, render, "")]})
-    assert sheet.shape[0] == load_png(tmp_path / "one.png").shape[0] + 52  # another heading
+    assert sheet.shape[0] == sheet_of(tmp_path, {"a": rows * 2}).shape[0] + 52  # another heading
 
 
 def test_contact_sheet_takes_mixed_sizes_strange_names_and_jpeg(tmp_path):
     """In names with dollars there is no mathematics."""
     rows = [view("a/very/long/folder/" * 5 + "0001.jpg"), view("$^$.png", 80, 60), view("$1_$2_.png", 1, 1)]
-    report.contact_sheet(tmp_path / "sheet.jpg", {"$^$": rows}, columns=2)
-    assert load_png(tmp_path / "sheet.jpg").shape[1] == 1600
+    assert sheet_of(tmp_path, {"$^$": rows}, "sheet.jpg", columns=2).shape[1] == 1600
 
 
 @pytest.mark.parametrize(
@@ -121,12 +121,9 @@ def test_plot_profile(tmp_path):
 
 
 def test_nothing_to_draw_is_said(tmp_path):
-    for draw, nothing in (
-        (report.contact_sheet, {}),
-        (report.plot_training, [{"iteration": 1}]),
-        (report.plot_profile, {}),
-    ):
-        refusal(partial(draw, tmp_path / "a.png", nothing), "expected")
+    nothing = {report.contact_sheet: {}, report.plot_training: [{"iteration": 1}], report.plot_profile: {}}
+    for draw, given in nothing.items():
+        refusal(partial(draw, tmp_path / "a.png", given), "expected")
     name, photo, render, said = view()
     wrong = {"": [(name, photo, render[1:], said)]}
     refusal(lambda: report.contact_sheet(tmp_path / "a.png", wrong), "expected a render of shape")
