@@ -103,7 +103,6 @@ BAD = {
     "model": (folder_case("point_cloud"), ["found a trained model", "folder of its scene"]),
     "resolution-0": (colmap_case(options={"resolution": 0}), ["resolution", "got 0"]),
     "resolution-absurd": (colmap_case(options={"resolution": 1_000_000}), [".png", "1000000", "-r"]),
-    "resolution-negative": (colmap_case(options={"resolution": -2}), ["resolution", "got -2"]),
     "eval-one-image": (
         colmap_case(options={"eval": True}, names=["only.png"]),
         ["at least 2 images", "found 1", "--eval"],
@@ -132,14 +131,6 @@ BAD = {
     ),
     "opengl-axes": (colmap_case(points=BEHIND), ["none of the 3 training cameras", "axes are probably mixed up"]),
     "empty-points": (model_case("points3D.bin", lambda path: cut(path, 0)), ["points3D.bin", "0 bytes"]),
-    **{
-        f"cut-{name}": (model_case(f"{name}.bin", lambda path: cut(path, 0.7)), [f"{name}.bin", "cut short"])
-        for name in ("points3D", "images", "cameras", "frames")
-    },
-    "garbage-points": (
-        model_case("points3D.bin", lambda path: path.write_bytes(texture().tobytes())),
-        ["points3D.bin", "damaged"],
-    ),
     "garbage-text": (model_case("points3D.txt", lambda path: path.write_text("hello you\n")), ["sparse/0", "pycolmap"]),
     "unknown-model": (
         model_case("cameras.txt", lambda path: replace(path, b"PINHOLE", b"WIDE_EYE")),

@@ -39,12 +39,9 @@ def test_camera_of_a_browser():
     "change",
     [
         {"wxyz": np.zeros(4)},
-        {"wxyz": np.full(4, np.nan)},
         {"position": np.array([np.inf, 0, 0])},
         {"fov": 0.0},
-        {"fov": np.nan},
         {"width": 0},
-        {"height": 0},
         {"width": 1e300},
         {"wxyz": np.ones(3)},
         {"position": np.zeros(2)},
