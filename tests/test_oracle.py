@@ -48,6 +48,13 @@ def test_two_layers_closed_form_whatever_the_order_of_input():
     assert out.depth[3, 4].item() == pytest.approx((0.4 * 2 + 0.42 * 5) / 0.82, rel=1e-12)
 
 
+def test_clamp_and_stop():
+    out = ball(z=[1.0, 2, 3], sigma=[1.0, 1, 1], opacity=[1.0, 0.98, 0.98], rgb=[[1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    # 0.99 first; 0.01 * 0.02 = 2e-4 may go on; 4e-6 may not, so the third is not blended and T stays at 2e-4
+    assert out.image[3, 4].tolist() == pytest.approx([0.99, 0.01 * 0.98, 0], rel=1e-12)
+    assert out.alpha[3, 4].item() == pytest.approx(1 - 2e-4, rel=1e-12)
+
+
 def test_spherical_harmonics_match_scipy():
     x, y, z = directions = np.random.default_rng(0).normal(size=(3, 50))
     x, y, z = directions / np.linalg.norm(directions, axis=0)
