@@ -3,6 +3,7 @@
 import re
 import socket
 import time
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -63,6 +64,20 @@ def open_page(page, address):
     page.get_by_text("px in").wait_for(timeout=1e3 * PATIENCE)
 
 
+@contextmanager
+def watched(*command):
+    """Yield the page of a command with a viewer, its errors, the process, the address, and what was said so far."""
+    with browser_page(WIDTH, HEIGHT) as (page, errors), served(*command) as (process, address, said):
+        open_page(page, address)
+        yield page, errors, process, address, said
+
+
+def paused(page):
+    """Pause a training."""
+    page.get_by_role("button", name="Pause").click()
+    page.get_by_text("paused").wait_for(timeout=1e3 * PATIENCE)
+
+
 def screenshot(page, folder):
     page.screenshot(path=folder / "screenshot.png")
     return load_png(folder / "screenshot.png")
@@ -94,8 +109,7 @@ def test_view(scene, model, tmp_path):
     wanted = to_bytes(draw(camera, False).image)
     aside = Camera(WIDTH, HEIGHT, camera.fx, camera.fy, camera.cx + 1, camera.cy, camera.rotation, camera.translation)
     level = max(likeness(to_bytes(draw(aside, False).image), wanted), 30.0)
-    with browser_page(WIDTH, HEIGHT) as (page, errors), served("view", model, "-s", SCENE) as (process, address, _):
-        open_page(page, address)
+    with watched("view", model, "-s", SCENE) as (page, errors, process, *_):
         assert f"{len(scene.points):,} Gaussians" in page.inner_text("body")
         page.get_by_role("button", name="next").click()
         eventually(lambda: likeness(shot(), wanted) > level)
@@ -129,12 +143,8 @@ def test_second_browser_busy_port_and_missing_scene(model, tmp_path):
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         port = taken.getsockname()[1]
-        with (
-            browser_page(WIDTH, HEIGHT) as (page, errors),
-            served("view", model, "--port", port) as (process, address, said),
-        ):
+        with watched("view", model, "--port", port) as (page, errors, process, address, said):
             assert f"(port {port} is taken)" in said and "Without photographs" in said
-            open_page(page, address)
             other = page.context.browser.new_page(viewport={"width": 300, "height": 200})
             open_page(other, address)
             drag(other, (50, 150), (90, 160), 3)
@@ -153,13 +163,8 @@ TRAINING = f"-s {SCENE} -r 8 --iterations 1000 --densify_from_iter 20 --max_gaus
 @pytest.mark.long
 def test_training(tmp_path):
     """Looked at, moved around in, paused, continued: the same bytes as without."""
-    with (
-        browser_page(WIDTH, HEIGHT) as (page, errors),
-        served("train", *TRAINING, "-m", tmp_path / "seen", "--viewer") as (process, address, _),
-    ):
-        open_page(page, address)
-        page.get_by_role("button", name="Pause").click()
-        page.get_by_text("paused").wait_for(timeout=1e3 * PATIENCE)
+    with watched("train", *TRAINING, "-m", tmp_path / "seen", "--viewer") as (page, errors, process, *_):
+        paused(page)
         count = re.search(r"iteration ([\d,]+) of 1,000, paused", page.inner_text("body"))[1]
         before = screenshot(page, tmp_path)
         eventually(lambda: likeness(dragged(page, tmp_path), before) < 25)  # more than once, while all is a blur
@@ -177,16 +182,8 @@ def test_training(tmp_path):
 
 @pytest.mark.long
 def test_interrupted_training(tmp_path):
-    with (
-        browser_page(WIDTH, HEIGHT) as (page, _),
-        served("train", *TRAINING, "--iterations", 100_000, "-m", tmp_path / "model", "--viewer") as (
-            process,
-            address,
-            _,
-        ),
-    ):
-        open_page(page, address)
-        page.get_by_role("button", name="Pause").click()
-        page.get_by_text("paused").wait_for(timeout=1e3 * PATIENCE)
+    command = "train", *TRAINING, "--iterations", 100_000, "-m", tmp_path / "model", "--viewer"
+    with watched(*command) as (page, _, process, *_):
+        paused(page)
         code, said = end(process)
         assert code == 130 and "To continue after iteration" in said
