@@ -229,6 +229,10 @@ def test_small_models(fake_viser, count, coefficients):
         assert len(client.frames) == 3
 
 
+def test_no_model_is_refused():
+    refusal(lambda: view_model(ViewConfig()), "MODEL: expected the folder")
+
+
 @pytest.mark.parametrize(("source", "tolerance"), [("", 0.0), ("scene", 0.0), ("", 0.5)])
 def test_a_file_of_a_scene_in_linear_light(fake_viser, monkeypatch, tmp_path, source, tolerance):
     """A file does not say what light it was trained in; its scene does."""
