@@ -134,9 +134,8 @@ def test_the_better_mapper_is_taken_and_completed(truth, mapped, monkeypatch):
 
     stepwise = mapping._map_stepwise
     monkeypatch.setattr(mapping, "_map_globally", found(range(12)))
-    monkeypatch.setattr(
-        mapping, "_map_stepwise", lambda *a, **k: stepwise(*a, **k) if len(a) > 4 else found(range(8, 17))(*a, **k)
-    )
+    either = lambda *a, **k: (stepwise if len(a) > 4 else found(range(8, 17)))(*a, **k)  # noqa: E731
+    monkeypatch.setattr(mapping, "_map_stepwise", either)
     models, lines = mapped()
     assert list(models) == [0] and models[0].num_reg_images() == COUNT and farthest(models[0], model) < 1e-4
     assert len(lines) == 1 and "global mapping" in lines[0] and "global 12" in lines[0] and "incremental 9" in lines[0]

@@ -315,6 +315,5 @@ def test_files_and_checkpoints(scene, tmp_path, fails):
 
 def test_schedules_are_marked():
     marked = {item.name for item in flags_of(TrainConfig) if item.metadata["schedule"]}
-    assert marked == {name for name in TrainConfig().flat() if name.endswith("_iter")} | {
-        *("iterations", "position_lr_max_steps", "cooldown", "sh_interval", "opacity_reset_interval")
-    }
+    others = {"iterations", "position_lr_max_steps", "cooldown", "sh_interval", "opacity_reset_interval"}
+    assert marked == {name for name in TrainConfig().flat() if name.endswith("_iter")} | others

@@ -77,10 +77,8 @@ def test_within_a_tolerance_what_is_too_faint_for_the_usual_cut_counts():
     means = gaussians.means + torch.linspace(0.0, 1e-3, count)[:, None] * forward
     dark = torch.where(torch.arange(count) < count // 2, -1.7, 1.7)[:, None, None].expand(count, 1, 3)
     gaussians = gaussians._replace(means=means, sh_dc=dark, opacities=torch.full((count,), 0.0039))
-    first, second = (
-        render(gaussians._replace(means=order), camera, torch.zeros(3), options).image
-        for order in (means, means.flip(0))
-    )
+    orders = (gaussians._replace(means=order) for order in (means, means.flip(0)))
+    first, second = (render(given, camera, torch.zeros(3), options).image for given in orders)
     change = (first - second).abs().amax(2)
     assert 0.1 < change.max() and (change <= popping_of(gaussians, camera, options) + 1e-3).all()
 

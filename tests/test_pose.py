@@ -139,11 +139,8 @@ def test_the_error_of_a_pose_is_the_way_of_its_points(scene):
     for view in scene.train[:5]:
         camera, seen = view.original, scene.tracks[view.name]
         right = seen._replace(slopes=slopes_of(camera, seen.points))
-        wrong = replace(
-            camera,
-            rotation=Rotation.from_rotvec([0.004, -0.006, 0.01]).as_matrix() @ camera.rotation,
-            translation=camera.translation + 0.01,
-        )
+        turn = Rotation.from_rotvec([0.004, -0.006, 0.01]).as_matrix()
+        wrong = replace(camera, rotation=turn @ camera.rotation, translation=camera.translation + 0.01)
         way = (slopes_of(wrong, seen.points) - right.slopes) * [camera.fx, camera.fy]
         assert pose_error(wrong, right) == pytest.approx(np.sqrt((way**2).sum(1).mean()), rel=0.02)
         assert pose_error(camera, right) < 1e-9

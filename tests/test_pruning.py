@@ -38,11 +38,10 @@ def splats_before(camera, count=40, seed=0, depth=(3, 5), scale=-2.0):
     """Gaussians in front of a camera, of degree 3, none of them dark."""
     rng = np.random.default_rng(seed)
     seen = np.stack([rng.uniform(-1, 1, count), rng.uniform(-0.8, 0.8, count), rng.uniform(*depth, count)], axis=1)
+    sh = [rng.uniform(0.5, 1.5, (count, 1, 3)), rng.normal(scale=0.05, size=(count, 15, 3))]
     return SplatArrays(
         means=(seen @ camera.rotation + camera.center).astype(np.float32),
-        sh=np.concatenate(
-            [rng.uniform(0.5, 1.5, (count, 1, 3)), rng.normal(scale=0.05, size=(count, 15, 3))], axis=1
-        ).astype(np.float32),
+        sh=np.concatenate(sh, axis=1).astype(np.float32),
         opacities=rng.uniform(-1, 2, count).astype(np.float32),
         scales=rng.normal(scale, 0.3, (count, 3)).astype(np.float32),
         quats=rng.normal(size=(count, 4)).astype(np.float32),
@@ -180,9 +179,8 @@ def test_a_view_that_is_drawn_exactly_hides_no_other():
 def test_floaters_hang_before_few_cameras():
     """A cloud that eight cameras see, and a Gaussian right before one of them."""
     first = make_camera(*SIZE, seed=3)
-    cameras = [
-        replace(first, translation=first.translation + np.float64([0.3 * step, 0, 0])) for step in np.arange(8) - 4.0
-    ]
+    places = [first.translation + np.float64([0.3 * step, 0, 0]) for step in np.arange(8) - 4.0]
+    cameras = [replace(first, translation=place) for place in places]
     splats = splats_before(first, 60, depth=(4, 6))
     floater = splats_before(first, 1)
     floater.means[:] = np.float32([[0, 0, 0.4]]) @ cameras[2].rotation + cameras[2].center

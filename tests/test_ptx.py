@@ -47,6 +47,11 @@ def through(camera) -> None:
     differentiate(replace(small(), camera=camera), "manual", RasterOptions())
 
 
+def through_rolling() -> None:
+    camera = small().camera
+    through(Camera.rolling(camera, replace(camera, translation=camera.translation + 0.02)))
+
+
 def through_learned(lens) -> None:
     camera = replace(small().camera, lens=lens)
     through(CameraParameters(camera, coefficients=torch.tensor(lens.coefficients, requires_grad=True)))
@@ -65,9 +70,8 @@ def list_many_tiles() -> None:
 
 
 def activate() -> None:
-    sum(
-        x.square().sum() for x in Activate.apply(*(torch.randn(size, requires_grad=True) for size in ((203, 3), 203)))
-    ).backward()
+    given = (torch.randn(size, requires_grad=True) for size in ((203, 3), 203))
+    sum(x.square().sum() for x in Activate.apply(*given)).backward()
 
 
 def put_sky_behind() -> None:
@@ -103,9 +107,7 @@ RUNS: dict[str, Callable[[dict], None]] = {
     "opencv, learned": lambda _: through_learned(OPENCV),
     "fisheye, learned": lambda _: through_learned(FISHEYE),
     "camera": lambda _: through(CameraParameters(small().camera)),
-    "rolling shutter": lambda _: through(
-        Camera.rolling(small().camera, replace(small().camera, translation=small().camera.translation + 0.02))
-    ),
+    "rolling shutter": lambda _: through_rolling(),
     "sky": lambda _: put_sky_behind(),
     "map of colors": lambda _: map_colors(),
     "activate": lambda _: activate(),

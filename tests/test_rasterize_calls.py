@@ -41,9 +41,8 @@ def test_an_opacity_has_its_gradient_where_its_weight_underflows(adjoint):
     scales = torch.tensor([[50.0] * 3] * in_front + [[0.5] * 3])
     quats, sh = torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(in_front + 1, 1), torch.full((in_front + 1, 1, 3), 0.7)
     options = RasterOptions(alpha_min=0.0, t_min=0.0)
-    warp_splat.rasterize(
-        means, quats, scales, opacities, sh, camera, (0.1, 0.2, 0.3), adjoint, options
-    ).image.sum().backward()
+    given = means, quats, scales, opacities, sh, camera, (0.1, 0.2, 0.3), adjoint, options
+    warp_splat.rasterize(*given).image.sum().backward()
     variance = (camera.fx * 0.5 / 8.0) ** 2 + 0.3  # px^2: all its pixels together are 2 pi of these
     light = 3 * (0.5 + 0.7 * 0.28209479) - 0.6  # that it adds, less the background's that it hides
     expected = 0.01**in_front * 2 * math.pi * variance * light
@@ -346,9 +345,8 @@ def test_signs_of_upstream_and_of_a_surface(device):
     options = [RasterOptions(hidden_from=depth) for depth in (surface, torch._neg_view(-surface))]
     images = [call(device, means=leaf, options=one).image for one in options]
     weight = torch.rand(images[0].shape, device=device)
-    found = [
-        torch.autograd.grad(images[0], leaf, up, retain_graph=True)[0] for up in (weight, torch._neg_view(-weight))
-    ]
+    ups = weight, torch._neg_view(-weight)
+    found = [torch.autograd.grad(images[0], leaf, up, retain_graph=True)[0] for up in ups]
     assert torch.equal(*images) and torch.equal(*found) and found[0].any()
 
 

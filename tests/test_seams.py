@@ -145,7 +145,7 @@ def test_what_a_part_learns_is_adams_step_of_the_mean_gradient(scene, monkeypatc
 
 
 @pytest.mark.slow
-def test_flags_files_and_output_know_them(tmp_path, capsys, fails):
+def test_flags_files_and_output_know_them(tmp_path, capsys, fails, ran):
     """Of those that the scene does not need, the figure is told."""
     options = "--no-quiet --parts auto --growth faint --gain_lr 0.5 --iterations 12"
     assert train(tmp_path / "a", *options.split()) == 0
@@ -155,20 +155,17 @@ def test_flags_files_and_output_know_them(tmp_path, capsys, fails):
     config = read_config(tmp_path / "a" / "config.toml")
     assert (config["parts"], config["growth"], config["gain_lr"]) == ("gain", "faint", 0.5)
     assert load_options(tmp_path / "a")["faint_below"] == 0.02
-    assert main(["train", "--resume", str(tmp_path / "a"), "--iterations", "24"]) == 0
+    ran("train", "--resume", tmp_path / "a", "--iterations", 24)
     assert train(tmp_path / "b", "--config", str(tmp_path / "a" / "config.toml"), "--iterations", "24") == 0
     assert ply_path(tmp_path / "a", 24).read_bytes() == ply_path(tmp_path / "b", 24).read_bytes()
-    capsys.readouterr()
-    assert main(["train", "--resume", str(tmp_path / "b"), "--parts", "floaters", "--no-quiet"]) == 0
-    assert "Warning: the part gain is left out from here on" in "".join(capsys.readouterr())
+    said = ran("train", "--resume", tmp_path / "b", "--parts", "floaters", "--no-quiet")
+    assert "Warning: the part gain is left out from here on" in said
     with pytest.raises(SystemExit):
         main(["train", "--help"])
     assert "--gain_lr FLOAT" in capsys.readouterr().out
     begun = ["train", "-s", str(SCENE), "-m", str(tmp_path / "c")]
-    assert (
-        "--parts: expected auto, or some of random_background, sky, exposure, pose, depth, surface, floaters, gain"
-        in fails(*begun, "--parts", "weather")
-    )
+    names = "random_background, sky, exposure, pose, depth, surface, floaters, gain"
+    assert f"--parts: expected auto, or some of {names}" in fails(*begun, "--parts", "weather")
     assert "--growth: expected one of reference, budget, mcmc, faint" in fails(*begun, "--growth", "weather")
 
 

@@ -31,12 +31,10 @@ def row_by_row(scene):
 
 def test_rows_are_those_of_cameras_that_stand_still(device):
     scene = scene_of("rolling degree2").to(device)
-    still = replace(scene.camera, shutter=None)
-    wanted = row_by_row(scene)
-    rolling, frozen = (
-        rasterize(*scene.parameters(), camera, scene.background).image for camera in (scene.camera, still)
-    )
-    off = [float((image - wanted).square().mean().sqrt()) for image in (rolling, frozen)]
+    wanted, off = row_by_row(scene), []
+    for camera in (scene.camera, replace(scene.camera, shutter=None)):
+        image = rasterize(*scene.parameters(), camera, scene.background).image
+        off.append(float((image - wanted).square().mean().sqrt()))
     assert off[0] < 2e-3 and off[0] < 0.06 * off[1], off
 
 
@@ -93,17 +91,15 @@ def test_beyond_the_picture_the_motion_ends_and_that_alone_is_what_an_oracle_wit
     given = [torch.stack([across, down, depth], 1), 2 * uniform(4) - 1, 0.2 + uniform(3), 0.2 + 0.6 * uniform()]
     given.append(2 * uniform(1, 3) - 1)
     camera = Camera(64, 48, 50.0, 50.0, 32.0, 24.0, np.eye(3), np.zeros(3), shutter=SHUTTER)
-    leaves, exact_leaves = (
-        [t.to(kind, copy=True).requires_grad_() for t in given] for kind in (torch.float32, torch.float64)
-    )
+    kinds = torch.float32, torch.float64
+    leaves, exact_leaves = ([t.to(kind, copy=True).requires_grad_() for t in given] for kind in kinds)
     out = rasterize(*leaves, camera)
     weights = torch.randn(48, 64, 3, generator=generator)
 
     def off():
         """The largest difference of a sure pixel, and of a gradient relative to its norm."""
-        wanted = exact_cameras.exact_render(
-            *exact_leaves, camera, torch.zeros(3).double(), **for_oracle(RasterOptions())
-        )
+        black, options = torch.zeros(3).double(), for_oracle(RasterOptions())
+        wanted = exact_cameras.exact_render(*exact_leaves, camera, black, **options)
         sure = ~wanted.fragile
         loss = ((out.image * weights)[sure].sum(), (wanted.image * weights)[sure].sum())
         found = torch.autograd.grad(loss[0], leaves, retain_graph=True)
@@ -119,9 +115,8 @@ def test_beyond_the_picture_the_motion_ends_and_that_alone_is_what_an_oracle_wit
 
 def test_nothing_that_only_other_rows_see_is_lost(device):
     """A Gaussian beyond the picture of the middle row, which the first rows see; one behind its camera."""
-    camera = Camera(
-        20, 40, 30.0, 30.0, 10.0, 20.0, np.eye(3), np.zeros(3), shutter=Shutter((0.0, 0.9, 0.0), (0.0, 0.0, 0.0))
-    )
+    turning = Shutter((0.0, 0.9, 0.0), (0.0, 0.0, 0.0))
+    camera = Camera(20, 40, 30.0, 30.0, 10.0, 20.0, np.eye(3), np.zeros(3), shutter=turning)
     first = camera.at(3)
     ray = first.rays(np.array([[10.0, 3.5]]))[0]
     near = replace(camera, shutter=Shutter((0.0, 0.0, 0.0), (0.0, 0.0, 1.0)))
@@ -182,9 +177,8 @@ def test_two_poses_at_the_limits_make_a_camera_that_learns():
 
 def test_a_projection_of_ones_own_knows_no_shutter():
     scene, own = scene_of("rolling single"), RasterOptions(projection=affine.PROJECTION)
-    with pytest.raises(
-        InputError, match=r"options\.projection: expected one by name for a camera with a rolling shutter"
-    ):
+    sentence = r"options\.projection: expected one by name for a camera with a rolling shutter"
+    with pytest.raises(InputError, match=sentence):
         rasterize(*scene.parameters(), scene.camera, options=own)
 
 

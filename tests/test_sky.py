@@ -102,12 +102,10 @@ def test_a_damaged_file_is_one_sentence(text, tmp_path, fails):
 
 
 def test_what_is_cut_out_has_no_sky(scene, tmp_path):
-    clear = [
-        replace(view, photograph=view.pixels._replace(alpha=np.zeros(view.image.shape[:2], np.uint8)))
-        for view in scene.train
-    ]
+    clear = [view.pixels._replace(alpha=np.zeros(view.image.shape[:2], np.uint8)) for view in scene.train]
+    train = [replace(view, photograph=pixels) for view, pixels in zip(scene.train, clear, strict=True)]
     with pytest.raises(InputError, match="--parts sky: expected photographs that are nowhere transparent, found"):
-        begin(replace(scene, train=clear), tmp_path, parts="sky")
+        begin(replace(scene, train=train), tmp_path, parts="sky")
 
 
 @pytest.mark.parametrize("roll", [0, 90, 180, 270])

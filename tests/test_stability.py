@@ -174,8 +174,6 @@ def test_run_writes_and_counts(tmp_path, monkeypatch):
 def test_a_verdict_names_the_modes_that_failed():
     good = verdict.Outcome("nothing", 0.0, None, 0.0, "-", ())
     bad = good._replace(failures=("wrong",))
-    verdicts = [
-        cases.Row(cases.CASES[0], {"manual": first, "stored": second}).verdict
-        for first, second in ((good, good), (good, bad), (bad, bad))
-    ]
+    outcomes = ({"manual": first, "stored": second} for first, second in ((good, good), (good, bad), (bad, bad)))
+    verdicts = [cases.Row(cases.CASES[0], each).verdict for each in outcomes]
     assert verdicts == ["pass", "FAIL stored", "FAIL"]

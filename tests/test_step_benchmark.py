@@ -71,9 +71,8 @@ def test_floor_is_the_larger_of_its_two_parts():
     limit = limits.Limits(bandwidth=100.0, rate=2.0)
     assert limit.floor(300.0, 16.0) == 3.0 and limit.floor(100.0, 160.0) == 5.0
     # 2 Gaussians of degree 0, one of which is drawn, on 10 pixels: by hand
-    counts = work.Counts(
-        gaussians=2, coefficients=1, drawn=1, pixels=10, instances=3, pairs=7, looked_at=32, by_adjoint=16
-    )
+    counted = {"instances": 3, "pairs": 7, "looked_at": 32, "by_adjoint": 16}
+    counts = work.Counts(gaussians=2, coefficients=1, drawn=1, pixels=10, **counted)
     found = work.work_of(counts)
     assert found["project"] == (2 * 48 + 60, 240) and found["blend"] == (12 + 48 + 240, 7 * 31)
     assert found["Adam"][0] == 2 * 14 * 4 * 7 and found["host"] == (0, 0)
@@ -142,14 +141,12 @@ def test_degree_rises_without_a_compilation(monkeypatch, capsys):
 def test_serial_time_is_what_slices_do_not_share(two_threads):
     """Spans by hand; and a step, of which no stage is longer in serial than it is."""
     assert serial.shared([(0.0, 2.0), (1.0, 4.0), (1.5, 1.75), (6.0, 7.0)], 0.5, 6.5) == pytest.approx(1.0)
-    assert (
-        serial.shared([(0.0, 2.0), (1.0, 4.0)], 1.5, 3.0) == pytest.approx(0.5) and serial.shared([], 0.0, 1.0) == 0.0
-    )
+    assert serial.shared([(0.0, 2.0), (1.0, 4.0)], 1.5, 3.0) == pytest.approx(0.5)
+    assert serial.shared([], 0.0, 1.0) == 0.0
     job = pool._Job
     seconds, alone = serial.measure(made_up.steps_of(made_up.make_trainer(3000, 64, 48, "cpu")), 2)
-    assert pool._Job is job and all(
-        0.0 <= alone[stage] <= seconds[stage] for stage in (*gpu_steps.STAGES, "whole step")
-    )
+    assert pool._Job is job
+    assert all(0.0 <= alone[stage] <= seconds[stage] for stage in (*gpu_steps.STAGES, "whole step"))
 
 
 def test_blends_in_lanes_agree_with_those_of_one_pixel_each():

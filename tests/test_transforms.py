@@ -85,9 +85,8 @@ def test_transforms_with_lists_of_names(tmp_path):
     assert [view.name for view in scene.test] == [names[1]]
     assert lines == ["Leaving out 2 of 5 images that transforms.json neither trains nor tests on."]
     assert [view.name for view in load(root)[0].train] == [names[0], names[3], names[1]]
-    scene, lines = load(
-        write_transforms(tmp_path, names, test_filenames=names[2:4], val_filenames=names[:1]), eval=True
-    )
+    root = write_transforms(tmp_path, names, test_filenames=names[2:4], val_filenames=names[:1])
+    scene, lines = load(root, eval=True)
     assert [view.name for view in scene.train] == [names[0], names[1], names[4]] and not lines
     assert [view.name for view in scene.test] == names[2:4]
 

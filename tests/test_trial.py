@@ -80,10 +80,8 @@ def test_trials_have_the_rates_of_the_training(scene):
 
 
 def test_points_that_all_photographs_show_are_said_to_be():
-    views = [
-        SimpleNamespace(name=str(place), camera=Camera(9, 9, 9.0, 9.0, 4.5, 4.5, np.eye(3), np.zeros(3)))
-        for place in range(3)
-    ]
+    camera = Camera(9, 9, 9.0, 9.0, 4.5, 4.5, np.eye(3), np.zeros(3))
+    views = [SimpleNamespace(name=str(place), camera=camera) for place in range(3)]
     scene = SimpleNamespace(train=views, tracks={"0": None}, points=np.float32([[0, 0, 5]] * 4))
     assert few_photographs(scene, 25) == (True, "half of its points lie in all 3 photographs (limit 25)")
 

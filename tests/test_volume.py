@@ -210,12 +210,11 @@ def test_bad_volumes_are_refused(name, value):
 
 
 def test_run_writes_its_files(tmp_path, monkeypatch):
-    for name, value in {"OPTICAL_DEPTHS": (1.0, 1e6), "SAMPLES": [8, 64, 512, 4096], "REPEATS": 1, "RAYS": 2}.items():
-        monkeypatch.setattr(measure, name, value)
-    monkeypatch.setattr(measure, "LIMIT_DEPTHS", (1e2,))
     scenes = {name: measure.SCENES[name] for name in ("one", "needle at the edge")}
-    monkeypatch.setattr(measure, "SCENES", scenes)
-    monkeypatch.setattr(measure, "PICTURED", tuple(scenes))
+    few = {"OPTICAL_DEPTHS": (1.0, 1e6), "SAMPLES": [8, 64, 512, 4096], "REPEATS": 1, "RAYS": 2}
+    few |= {"LIMIT_DEPTHS": (1e2,), "SCENES": scenes, "PICTURED": tuple(scenes)}
+    for name, value in few.items():
+        monkeypatch.setattr(measure, name, value)
     said = []
     results = measure.compare_with_physics(tmp_path / "new", said.append)
     assert {record["rung"] for record in results["ladder"]} == set(measure.PARENT)
