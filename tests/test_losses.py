@@ -45,10 +45,17 @@ def check(image, target, share=0.2, mask=None, value=1e-6, slope=1e-5):
     return loss, gradient
 
 
+def pictures(size, kind="floats", seed=2):
+    """An image and a target of this kind."""
+    image, target = torch.rand(2, *size, 3, generator=torch.Generator().manual_seed(seed))
+    image = image + 20.0 if kind == "far apart" else image
+    return image, (255 * target).to(torch.uint8) if kind == "bytes" else target
+
+
 @pytest.mark.parametrize("share", [0.0, 0.2, 1.0])
 @pytest.mark.parametrize("size", [(1, 1), (1, 40), (7, 3), (11, 16), (33, 50), (100, 67)])
 def test_value_and_gradient(size, share):
-    check(*torch.rand(2, *size, 3, generator=torch.Generator().manual_seed(sum(size))), share)
+    check(*pictures(size, seed=sum(size)), share)
 
 
 def both(image, target, share=0.2):
@@ -65,23 +72,20 @@ def both(image, target, share=0.2):
 @pytest.mark.parametrize("kind", ["floats", "bytes", "far apart"])
 def test_blocks_agree_with_the_lanes(kind, size, share):
     """Up to two strips of two bands, where each has both ends and neighbors."""
-    generator = torch.Generator().manual_seed(sum(size))
-    image, target = torch.rand(2, *size, 3, generator=generator)
-    if kind == "bytes":
-        target = (255 * target).to(torch.uint8)
-    if kind == "far apart":
-        image = image + 20.0
-    (loss, gradient), (found, found_gradient) = both(image, target, share)
+    (loss, gradient), (found, found_gradient) = both(*pictures(size, kind, sum(size)), share)
     assert abs(found - loss) < 1e-6 * max(1.0, abs(loss))
     assert (found_gradient - gradient).norm() < 1e-5 * gradient.norm()
 
 
 def test_loss_and_adjoint_are_stages(driver):
+    """The target may come from inference mode."""
     image = torch.rand(24, 35, 3).requires_grad_()
+    with torch.inference_mode():
+        target = torch.rand(24, 35, 3)
     with profile() as stages:
-        image_loss(image, torch.rand(24, 35, 3), 0.2).backward()
+        image_loss(image, target, 0.2).backward()
         assert set(stages) == {"loss", "adjoint of loss"} and min(stages.values()) > 0
-        assert not image_loss(image.detach(), torch.rand(24, 35, 3), 0.2).requires_grad
+        assert image.grad.any() and not image_loss(image.detach(), target, 0.2).requires_grad
 
 
 def test_blocks_find_equal_images_equal():
@@ -92,7 +96,7 @@ def test_blocks_find_equal_images_equal():
 
 def test_blocks_keep_what_is_not_finite_where_it_is():
     """A pixel that is not a number has no gradient, and makes the loss one that is none, as on a CPU."""
-    image, target = torch.rand(2, 40, 30, 3, generator=torch.Generator().manual_seed(2))
+    image, target = pictures((40, 30))
     image[20, 11, 1] = torch.nan
     (loss, gradient), (found, found_gradient) = both(image, target)
     assert loss != loss and found != found
@@ -103,10 +107,9 @@ def test_blocks_keep_what_is_not_finite_where_it_is():
 
 @pytest.mark.parametrize("size", [(1, 1), (2, 5), (33, 50), (40, 64)])
 def test_clamped_as_by_torch(size, driver):
-    generator = torch.Generator().manual_seed(sum(size))
-    image = 1.6 * torch.rand(*size, 3, generator=generator) - 0.3
+    image, target = pictures(size, "bytes")
+    image = 1.6 * image - 0.3
     image.view(-1)[:2] = torch.tensor([0.0, 1.0])
-    target = (255 * torch.rand(*size, 3, generator=generator)).to(torch.uint8)
     leaf, other = image.clone().requires_grad_(), image.clone().requires_grad_()
     loss, expected = image_loss(leaf, target, clamped=True), image_loss(other.clamp(0.0, 1.0), target)
     (2 * loss).backward()
@@ -144,12 +147,9 @@ def by_threads(image, target, threads):
 @pytest.mark.parametrize("size", [(455, 21), (897, 7), (128, 40)])
 @pytest.mark.parametrize("kind", ["floats", "bytes"])
 def test_bands_of_rows_are_right_and_change_no_bit(kind, size, threads):
-    image, target = torch.rand(2, *size, 3, generator=torch.Generator().manual_seed(2))
-    if kind == "bytes":
-        target = (255 * target).to(torch.uint8)
-    first, *others = by_threads(image, target, threads)
+    first, *others = by_threads(*pictures(size, kind), threads)
     assert all(torch.equal(other, first) for other in others)
-    check(image, target)
+    check(*pictures(size, kind))
 
 
 @pytest.mark.parametrize("height", [1, 2, 5, 6, 7, 11, 12, 13, 24])
@@ -161,7 +161,7 @@ def test_bands_of_few_rows(height, threads, monkeypatch):
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, 1e25, 1e30])
 def test_what_is_not_finite_spreads_alike_on_any_number_of_threads(value, threads):
-    image, target = torch.rand(2, 455, 21, 3, generator=torch.Generator().manual_seed(2))
+    image, target = pictures((455, 21))
     for picture in (image, target):
         for row in (64, 227, 300):
             spoilt = picture.clone()
@@ -169,14 +169,6 @@ def test_what_is_not_finite_spreads_alike_on_any_number_of_threads(value, thread
             pair = (spoilt, target) if picture is image else (image, spoilt)
             first, *others = by_threads(*pair, threads)
             assert all(torch.equal(other.nan_to_num(7.0), first.nan_to_num(7.0)) for other in others)
-
-
-def test_a_target_may_come_from_inference_mode():
-    with torch.inference_mode():
-        target = torch.rand(20, 30, 3)
-    image = torch.rand(20, 30, 3).requires_grad_()
-    image_loss(image, target).backward()
-    assert image.grad.abs().sum() > 0
 
 
 IMAGE, MASK = torch.zeros(20, 30, 3), torch.ones(20, 30, 1, dtype=torch.uint8)
