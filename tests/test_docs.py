@@ -33,42 +33,28 @@ WRITTEN = {"per_view.md"}  # by commands, not in the repository
 STEPS = "10"  # instead of thousands
 PHOTOGRAPHS = 6
 
-#: What shows that a line of the README's tables of inputs and outputs is true.
+#: What shows that a line of the README's tables of inputs and outputs is true: tests, without "test_".
 PROOFS = {
     "COLMAP, binary and text": """
-        test_scene.py::test_colmap_cameras_points_and_pixels test_scene.py::test_largest_of_several_models
-        test_scene.py::test_undistorted_image_is_the_ideal_pinhole_image""",
+        colmap_cameras_points_and_pixels largest_of_several_models undistorted_image_is_the_ideal_pinhole_image""",
     "nerfstudio, instant-ngp": """
-        test_transforms.py::test_transforms_cameras_points_and_axes test_transforms.py::test_transforms_with_distortion
-        test_transforms.py::test_transforms_intrinsics_of_frames_go_before_those_of_the_file""",
-    "nerf-synthetic": "test_scene.py::test_blender_axes_and_intrinsics test_scene.py::test_blender_splits",
-    "no points": "test_inputs.py::test_without_points_random_ones_in_the_views",
-    "images": """
-        test_scene.py::test_sixteen_bits_and_gray test_scene.py::test_jpeg
-        test_inputs.py::test_images_are_found_by_their_stems""",
-    "alpha": """
-        test_scene.py::test_alpha_is_composited_on_the_background
-        test_inputs.py::test_alpha_is_composited_on_random_backgrounds""",
-    "EXR, HDR, TIFF of floats": "test_inputs.py::test_floats_are_linear_light",
-    "masks": """
-        test_masks.py::test_masks_by_either_name test_masks.py::test_masked_loss
-        test_masks.py::test_metrics_do_not_see_what_is_masked""",
-    "`--start_ply FILE`": "test_inputs.py::test_start_from_a_file",
-    "`.ply`": "test_ply.py:: test_exchange.py::test_round_trip_returns_the_scene",
-    "`.compressed.ply`": "test_packed_formats.py::test_compressed_ply_bytes_are_those_that_other_programs_read",
-    "`.splat`": "test_exchange.py::test_splat_bytes_are_the_documented_layout",
-    "`.spz`": """
-        test_packed_formats.py::test_spz_bytes_are_the_documented_layout test_packed_formats.py::test_spz_version_2
-        test_packed_formats.py::test_spz_version_4_holds_the_same""",
-    "`.sog`": """
-        test_sog.py::test_sog_bytes_are_the_documented_layout test_sog.py::test_a_palette_stands_for_many_harmonics
-        test_sog.py::test_archives_of_others_are_read""",
-    "`.glb`, `.gltf`": """
-        test_gltf.py::test_gltf_holds_what_the_extension_says
-        test_gltf.py::test_gltf_nodes_move_turn_and_scale""",
+        transforms_cameras_points_and_axes transforms_with_distortion
+        transforms_intrinsics_of_frames_go_before_those_of_the_file""",
+    "nerf-synthetic": "blender_axes_and_intrinsics blender_splits",
+    "no points": "without_points_random_ones_in_the_views",
+    "images": "sixteen_bits_and_gray jpeg images_are_found_by_their_stems",
+    "alpha": "alpha_is_composited_on_the_background alpha_is_composited_on_random_backgrounds",
+    "EXR, HDR, TIFF of floats": "floats_are_linear_light",
+    "masks": "masks_by_either_name masked_loss metrics_do_not_see_what_is_masked",
+    "`--start_ply FILE`": "start_from_a_file",
+    "`.ply`": "reads_by_name_in_any_order_without_normals round_trip_returns_the_scene",
+    "`.compressed.ply`": "compressed_ply_bytes_are_those_that_other_programs_read",
+    "`.splat`": "splat_bytes_are_the_documented_layout",
+    "`.spz`": "spz_bytes_are_the_documented_layout spz_version_2 spz_version_4_holds_the_same",
+    "`.sog`": "sog_bytes_are_the_documented_layout a_palette_stands_for_many_harmonics archives_of_others_are_read",
+    "`.glb`, `.gltf`": "gltf_holds_what_the_extension_says gltf_nodes_move_turn_and_scale",
     "`.usd`, `.usda`, `.usdc`, `.usdz`": """
-        test_usd.py::test_a_stage_holds_what_the_schema_says_and_comes_back
-        test_usd.py::test_fields_are_joined_as_their_parents_place_them""",
+        a_stage_holds_what_the_schema_says_and_comes_back fields_are_joined_as_their_parents_place_them""",
 }
 
 
@@ -129,9 +115,9 @@ def test_every_input_and_output_has_its_test():
     tables = text[text.index("## What goes in") : text.index("## In your own torch code")]
     rows = [line.split("|")[1].strip() for line in tables.splitlines() if line.startswith("| ")]
     assert [row for row in rows if row not in ("in", "format")] == list(PROOFS)
-    for proof in " ".join(PROOFS.values()).split():
-        file, _, name = proof.partition("::")
-        assert f"def {name}" in (ROOT / "tests" / file).read_text(), proof
+    tests = "".join(path.read_text() for path in (ROOT / "tests").glob("test_*.py"))
+    for name in " ".join(PROOFS.values()).split():
+        assert f"def test_{name}(" in tests, name
 
 
 def test_the_picture_of_the_house_is_that_of_the_imports():
