@@ -41,7 +41,8 @@ def test_against_the_oracle(name, adjoint, blocks):
 
 @pytest.mark.parametrize("adjoint", ADJOINTS)
 def test_against_the_lanes(adjoint):
-    options = RasterOptions(depth=True, alpha_min=1e-3, t_min=1e-3)
+    """Also of loops that are cut after 100 steps, as of the longest tile."""
+    options = RasterOptions(depth=True, alpha_min=1e-3, t_min=1e-3, max_steps=100)
     with using(CUDA):
         first, gradients = run("dense_tile", "cpu", options, adjoint)
     second, expected = run("dense_tile", "cpu", options, adjoint)
@@ -76,13 +77,6 @@ def test_two_runs_give_the_same_bits(blocks):
     (first, gradients), (second, again) = (run("dense_tile", "cpu") for _ in range(2))
     assert torch.equal(first.image, second.image)
     assert all(torch.equal(gradients[key], again[key]) for key in gradients)
-
-
-def test_loop_cap():
-    options = RasterOptions(max_steps=100)
-    with using(CUDA):
-        image = run("dense_tile", "cpu", options)[0].image
-    assert (image - run("dense_tile", "cpu", options)[0].image).abs().max() < 1e-6
 
 
 @pytest.mark.parametrize("adjoint", ["manual", "reversible"])
