@@ -115,9 +115,7 @@ def spoil(old, new, name=BLOCK):
 NUMBERS = {"found none": (), "found 0 of block 2/2": (0,), "found 2 of block 1/2, 0 of block 2/2": (0, "00")}
 WRONG = {
     "found another model": lambda folder: (folder / LAST).touch(),
-    "trainings by --block, found another model": lambda folder: shutil.copytree(
-        folder / "1" / "point_cloud", folder / "point_cloud"
-    ),
+    "trainings by --block, found another": lambda folder: (folder / "1/point_cloud").rename(folder / "point_cloud"),
     "expected the number of blocks of": spoil('"cells": [', '"cells": [[[0, 0, 0], [1, 1, 1]], '),
     "expected the cells of": spoil("3.4", "3.1"),
     "expected the antialiasing of": spoil("antialiasing=False", "antialiasing=True", "cfg_args"),

@@ -152,7 +152,7 @@ def test_a_held_out_one_is_guessed_where_neighbors_are_alike():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
-def test_pictures_are_exposed_as_their_photographs(kind, tmp_path, ran, fails):
+def test_pictures_are_exposed_as_their_photographs(kind, tmp_path, ran):
     """In the evaluation as by render.py, of train and test views."""
     model = tmp_path / "model"
     options = f"--eval --iterations 60 --exposure {kind} --vignetting --exposure_lr_init 0.05 --quiet -r 8"
@@ -160,16 +160,11 @@ def test_pictures_are_exposed_as_their_photographs(kind, tmp_path, ran, fails):
     before = json.loads((model / "per_view.json").read_text())["ours_60"]
     ran("render", "-m", model, "--quiet")
     assert json.loads((model / "per_view.json").read_text())["ours_60"]["PSNR"] == before["PSNR"]
-    path = model / "point_cloud/iteration_60/exposures.json"
-    text = path.read_text()
     pictures = [load_png(model / f"{split}/ours_60/renders/00003.png") for split in ("train", "test")]
-    path.unlink()
+    (model / "point_cloud/iteration_60/exposures.json").unlink()
     ran("render", "-m", model, "--quiet")
     plain = [load_png(model / f"{split}/ours_60/renders/00003.png") for split in ("train", "test")]
     assert all((exposed != mean).any() for exposed, mean in zip(pictures, plain, strict=True))
-    path.write_text(text.replace('"kind"', '"sort"'))
-    sentence = fails("render", "-m", model, "--quiet")
-    assert "exposures.json: expected exposures as training writes them, found other JSON" in sentence
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -226,12 +221,10 @@ def test_it_learns_gains_to_two_percent_of_light(kind, scene, tmp_path):
     shown, _ = begin(replace(scene, train=few), tmp_path)
     light = [from_srgb(shown.picture(v.camera) / 255, np.where) * 2**gain for v, gain in zip(few, gains, strict=True)]
     images = [np.rint(255 * to_srgb(image, np.where).clip(0, 1)).astype(np.uint8) for image in light]
-    changed = replace(
-        scene, train=[replace(v, photograph=Decoded(image)) for v, image in zip(few, images, strict=True)]
-    )
-    trainer, _ = stepped(changed, tmp_path, 300, exposure=kind, iterations=300, **still)
+    views = [replace(view, photograph=Decoded(image)) for view, image in zip(few, images, strict=True)]
+    trainer, _ = stepped(replace(scene, train=views), tmp_path, 300, exposure=kind, iterations=300, **still)
     gray = torch.full((1, 1, 3), 0.4)
-    found = [trainer.parts[0].image(gray, None, SimpleNamespace(view=view)).mean().item() for view in changed.train]
+    found = [trainer.parts[0].image(gray, None, SimpleNamespace(view=view)).mean().item() for view in views]
     stops = 2.4 * np.log2((np.array(found) + 0.055) / 0.455)
     errors = stops - stops.mean() - (gains - gains.mean())
     assert np.abs(2**errors - 1).max() < 0.02
@@ -317,11 +310,10 @@ def test_exposures_are_those_beside_the_gaussians(trained):
     assert read_exposures(file.parent / "point_cloud.ply", 0)
 
 
-@pytest.mark.parametrize(
-    "changes",
-    ["{", "[]", {"kind": "else"}, {"maps": {"a": [1, 2]}}, {"maps": [1]}, {"falloff": [1e999, 0]}, {"pivot": "x"}],
-    ids=str,
-)
+DAMAGED = [{"kind": "else"}, {"maps": {"a": [1, 2]}}, {"maps": [1]}, {"falloff": [1e999, 0]}, {"pivot": "x"}]
+
+
+@pytest.mark.parametrize("changes", ["{", "[]", "{}", *DAMAGED], ids=str)
 def test_damaged_exposures_are_one_sentence(changes, trained, fails):
     folder, file = trained
     whole = file.read_text()

@@ -67,9 +67,7 @@ def test_what_is_no_checkpoint(content, words, tmp_path, fails):
     if content:
         path = tmp_path / content.get("name", path.name)
         safetensors.numpy.save_file({"a": np.zeros(3, np.float32)}, path, content.get("metadata"))
-    with pytest.raises(InputError) as error:
-        load_checkpoint(path)
-    assert all(word in one_sentence(error, path) for word in words)
+    one_sentence(refusal(lambda: load_checkpoint(path), *words), path)
     assert str(path) in fails("train", "--resume", str(path))
 
 
@@ -87,12 +85,10 @@ def test_a_folder_without_its_last_checkpoint(kept, tmp_path):
 @pytest.mark.parametrize(
     ("option", "value"),
     [
-        ("iterations", "60"),
         ("iterations", 0),
         ("iterations", 10**30),
         ("iterations", True),
         ("optimizer_type", "sgd"),
-        ("lambda_dssim", 2.0),
         ("lambda_dssim", float("nan")),
         ("save_iterations", [1, "2"]),
         ("source_path", None),
@@ -102,9 +98,7 @@ def test_a_folder_without_its_last_checkpoint(kept, tmp_path):
 def test_impossible_options(option, value, kept, tmp_path):
     facts = {**kept[1].facts, "options": {**kept[1].facts["options"], option: value}}
     save_checkpoint(tmp_path / LAST, {}, facts)
-    with pytest.raises(InputError) as error:
-        load_options(tmp_path)
-    assert option in one_sentence(error, tmp_path / LAST)
+    one_sentence(refusal(lambda: load_options(tmp_path), option), tmp_path / LAST)
     del facts["options"][option]  # an older program may not have known it
     save_checkpoint(tmp_path / LAST, {}, facts)
     assert load_options(tmp_path).get(option) == TrainConfig().flat().get(option)

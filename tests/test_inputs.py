@@ -13,7 +13,6 @@ from PIL import Image
 from scene_files import HEIGHT, WIDTH, load, texture, write_colmap, write_floats, write_image, write_transforms
 from splat_files import some_file
 
-from warp_splat.errors import InputError
 from warp_splat.formats.exchange import save_gaussians
 from warp_splat.formats.model_folder import ply_path
 from warp_splat.scene import load_scene
@@ -87,8 +86,8 @@ def test_start_from_a_file(tmp_path, degree, folder):
     assert np.abs(first.look(camera).image - second.look(camera).image).max() < 1e-6
     refusal(lambda: load(root, start=str(tmp_path / "b.ply")), "no such file")
     save_gaussians(tmp_path / "empty.ply", some_file(0))
-    with pytest.raises(InputError, match=r"empty\.ply: expected at least one Gaussian to start from"):
-        load(root, start=str(tmp_path / "empty.ply"))
+    empty = str(tmp_path / "empty.ply")
+    refusal(lambda: load(root, start=empty), "empty.ply: expected at least one Gaussian to start from")
 
 
 def test_a_limit_below_the_points_is_told(tmp_path):
@@ -143,15 +142,11 @@ def test_floats_are_linear_light(tmp_path, monkeypatch):
     view = scene.train[0]
     assert scene.linear and view.image.dtype == np.float32 and "a.exr for a.png" in lines[0]
     np.testing.assert_array_equal(view.image, light())  # above 1, too
-    x = light().clip(0, 1)
-    shown = np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055) * 255
-    assert np.abs(view.picture - shown).max() <= 0.5 + 1e-4 and view.picture.dtype == np.uint8
-    y = light()
-    curves = {
-        "srgb": np.where(y <= 0.0031308, 12.92 * y, 1.055 * y ** (1 / 2.4) - 0.055),
-        "log": (np.log(y + 1e-3) - np.log(1e-3)) / (np.log(1 + 1e-3) - np.log(1e-3)),
-    }
-    for space, expected in curves.items():
+    encoded = lambda x: np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)  # noqa: E731
+    assert np.abs(view.picture - 255 * encoded(light().clip(0, 1))).max() <= 0.5 + 1e-4
+    assert view.picture.dtype == np.uint8
+    logarithmic = (np.log(light() + 1e-3) - np.log(1e-3)) / (np.log(1 + 1e-3) - np.log(1e-3))
+    for space, expected in (("srgb", encoded(light())), ("log", logarithmic)):
         ((image, target),) = seen_targets(monkeypatch, scene, 1, loss_space=space)
         np.testing.assert_allclose(target, expected, atol=2e-6)
         assert image.isfinite().all()
@@ -204,7 +199,6 @@ def test_numbers_of_an_exr_are_those_of_z(tmp_path, channels, found):
         ("N.X N.Y N.Z", "expected R, G, B of one layer"),
         ("RY BY Y", "expected R, G, B of one layer"),
         ("R G", "expected R, G, B of one layer"),
-        ("X Y Z", "expected R, G, B of one layer"),
     ],
 )
 def test_colors_of_an_exr_are_found_by_their_names(tmp_path, channels, found):
@@ -258,8 +252,8 @@ def test_one_kind_of_light_in_a_scene(tmp_path):
     (root / "images" / "b.png").unlink()
     refusal(lambda: load(root), "one kind, but a.png is as a screen shows it and b.png in linear light")
     scene, _ = load(write_colmap(tmp_path / "png"))
-    with pytest.raises(InputError, match="--loss_space log: expected photographs in linear light"):
-        Trainer(scene, TrainConfig(device="cpu", loss_space="log"))
+    config = TrainConfig(device="cpu", loss_space="log")
+    refusal(lambda: Trainer(scene, config), "--loss_space log: expected photographs in linear light")
 
 
 def test_sixteen_bit_files_that_say_so_are_linear(tmp_path):
