@@ -17,6 +17,7 @@ SPREAD = 3 * ALPHA**2
 PINHOLE = {"radial_coeffs": [0.1, -0.05, 0.02, 0.03, -0.02, 0.01], "tangential_coeffs": [0.01, -0.02]}
 PINHOLE |= {"thin_prism_coeffs": [0.01, -0.004, -0.02, 0.006]}
 FISHEYE = {"radial_coeffs": [0.05, -0.03, 0.01, -0.002]}
+LENSES = [("pinhole", {}), ("pinhole", PINHOLE), ("fisheye", {}), ("fisheye", FISHEYE)]
 LEAVES = ("means", "quats", "scales", "viewmats", "Ks")
 
 
@@ -71,9 +72,7 @@ def in_float64(leaves):
     return {name: leaf.detach().double().requires_grad_() for name, leaf in leaves.items()}
 
 
-@pytest.mark.parametrize(
-    ("model", "coefficients"), [("pinhole", {}), ("pinhole", PINHOLE), ("fisheye", {}), ("fisheye", FISHEYE)]
-)
+@pytest.mark.parametrize(("model", "coefficients"), LENSES)
 def test_means_and_covariances_through_lenses(model, coefficients):
     lens = lens_of(coefficients)
     call = call_of(packed=False, with_ut=True, camera_model=model, rasterize_mode="antialiased", **lens)
@@ -141,12 +140,10 @@ def tangent(gradient, pose):
     return torch.cat([(part - part.mT).flatten(1), gradient[:, :3, 3]], 1)
 
 
-@pytest.mark.parametrize(
-    ("shutter", "axis", "reverse"),
-    [("TOP_TO_BOTTOM", 1, False), ("LEFT_TO_RIGHT", 0, False), ("BOTTOM_TO_TOP", 1, True), ("RIGHT_TO_LEFT", 0, True)],
-)
-def test_means_covariances_and_gradients_of_a_rolling_shutter(shutter, axis, reverse):
+@pytest.mark.parametrize("shutter", ["TOP_TO_BOTTOM", "LEFT_TO_RIGHT", "BOTTOM_TO_TOP", "RIGHT_TO_LEFT"])
+def test_means_covariances_and_gradients_of_a_rolling_shutter(shutter):
     """Each point is seen from where the camera stands when its row or column is read."""
+    axis, reverse = int("TOP" in shutter), shutter.startswith(("BOTTOM", "RIGHT"))
     call = call_of(packed=False, with_ut=True, rolling_shutter=Rolling[f"ROLLING_{shutter}"])
     last = moved_on(call["viewmats"], [1.0, 0.02, -0.03, 0.01], [1.0, -0.01, 0.02, 0.02])
     call["viewmats_rs"] = last.requires_grad_()
@@ -209,15 +206,10 @@ NEEDS = "rolling_shutter: expected with_ut=True and viewmats_rs"
     [
         ({"radial_coeffs": torch.zeros(2, 6)}, "radial_coeffs: expected None without with_ut=True"),
         (UNSCENTED | {"radial_coeffs": torch.zeros(2, 4)}, r"radial_coeffs: expected shape \[2, 6\]"),
-        (UNSCENTED | {"thin_prism_coeffs": torch.full((2, 4), torch.nan)}, "thin_prism_coeffs: expected finite"),
-        (
-            FISHEYE_CAMERA | {"tangential_coeffs": torch.zeros(2, 2)},
-            "tangential_coeffs: expected None without with_ut=True and camera_model pinhole",
-        ),
+        (FISHEYE_CAMERA | {"tangential_coeffs": torch.zeros(2, 2)}, "tangential_coeffs: .* and camera_model pinhole"),
         (UNSCENTED | {"camera_model": "ortho"}, "camera_model: expected pinhole or fisheye where with_ut is True"),
         (ROLLING | UNSCENTED, f"{NEEDS} with ROLLING_LEFT_TO_RIGHT"),
         (ROLLING | {"viewmats_rs": torch.eye(4).repeat(2, 1, 1)}, NEEDS),
-        (ROLLING | UNSCENTED | {"viewmats_rs": torch.eye(4)}, r"viewmats_rs: expected shape \[2, 4, 4\]"),
         (ROLLING | UNSCENTED | {"viewmats_rs": torch.zeros(2, 4, 4)}, "viewmats_rs: expected matrices from world to"),
     ],
 )
