@@ -13,7 +13,7 @@ from learned_cameras import DEPTH, HERE, NEAR, OTHER, PARTS, PLAIN, gradients_of
 from scenes import SCENES, SHUTTER, scene_of
 from scipy.spatial.transform import Rotation
 
-from warp_splat import CameraParameters, InputError, RasterOptions, check_gradients, rasterize, rasterize_views
+from warp_splat import CameraParameters, RasterOptions, check_gradients, rasterize, rasterize_views
 from warp_splat.raster.differences import INPUTS
 from warp_splat.raster.project import Project
 
@@ -123,11 +123,7 @@ def test_bad_input(arguments, message):
         ("single", {"last_twist": [0.0] * 6}, "last_twist: expected a base with a rolling shutter"),
         ("rolling single", {"last_twist": [2.0, 0, 0, 0, 0, 0]}, "Camera.rolling: expected a turn of at most 1 rad"),
         ("single", {"coefficients": [0.0] * 4}, f"{NO_COEFFICIENTS} whose lens has none, got some"),
-        (
-            "opencv",
-            {"coefficients": [0.0] * 3},
-            r"coefficients: expected a tensor of 4 real numbers, got torch.float32 \[3\]",
-        ),
+        ("opencv", {"coefficients": [0.0] * 3}, r"coefficients: expected a tensor of 4 .*, got torch.float32 \[3\]"),
         ("rolling opencv", {"coefficients": [0.0] * 4}, f"{NO_COEFFICIENTS} with a rolling shutter"),
         ("opencv", {"coefficients": [-0.9, 0, 0, 0]}, "Camera lens OPENCV: expected coefficients .* fold it"),
         ("opencv", {"coefficients": [torch.nan] * 4}, "Lens OPENCV: expected 4 finite coefficients"),
@@ -162,8 +158,8 @@ def test_check_gradients_looks_at_the_camera():
     report = check_gradients(*scene.parameters(), CameraParameters(scene.camera), directions=1)
     assert report.ok and {row.name for row in report.rows} == {*INPUTS, *POSE}
     assert check_gradients(*SCENES["empty"]().parameters(), CameraParameters(scene.camera), directions=1).ok
-    with pytest.raises(InputError, match="parameters: expected a list of some of means"):
-        check_gradients(*scene.parameters(), scene.camera, parameters=["focal"])
+    fixed = lambda: check_gradients(*scene.parameters(), scene.camera, parameters=["focal"])  # noqa: E731
+    refusal(fixed, "parameters: expected a list of some of means")
 
 
 @pytest.mark.parametrize(

@@ -1,10 +1,7 @@
 """The comparison: what it measures is right, and it measures what it says."""
 
 import json
-import subprocess
-import sys
 from dataclasses import asdict
-from pathlib import Path
 
 import compare_plots
 import knobs
@@ -12,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
+from commands import python
 from common import using
 from scenes import SCENES
 
@@ -30,7 +28,6 @@ from warp_splat.raster.project import project
 from warp_splat.runtime.launch import launch, view
 
 PLAIN = RasterOptions()
-ROOT = Path(__file__).parents[1]
 WITHOUT_GPU = pytest.mark.skipif(torch.cuda.is_available(), reason="a GPU is accepted where there is one")
 
 
@@ -197,5 +194,5 @@ def test_command_runs_the_catalog(failed, code, tmp_path, monkeypatch):
 )
 def test_whole_commands(command, files, tmp_path):
     """At their default size; 0: no verdict failed."""
-    subprocess.run([sys.executable, *command.split(), "--out", tmp_path], cwd=ROOT, check=True)
+    python(*command.split(), "--out", tmp_path)
     assert all((tmp_path / name).stat().st_size > 0 for name in files.split())

@@ -1,6 +1,5 @@
 """A falloff of the user's own, on both drivers, against the formulas in torch, pixel by pixel and in float64."""
 
-from contextlib import nullcontext
 from typing import Any
 
 import pytest
@@ -12,7 +11,7 @@ from heavy_tails import fall, heavy_tails, reach
 from hostile import refusal
 from scenes import SCENES
 
-from warp_splat import Falloff, InputError, RasterOptions, check_gradients, rasterize
+from warp_splat import Falloff, RasterOptions, check_gradients, rasterize
 from warp_splat.config import ALPHA_MAX
 from warp_splat.raster.drivers import CPU, CUDA
 from warp_splat.raster.gradcheck import _check_falloff
@@ -68,8 +67,7 @@ def test_gradients_agree_with_differences(adjoint):
 def test_manual_refuses_another_falloff_where_a_gradient_is_asked_for():
     scene = SCENES["degree1"]()
     leaves = [tensor.clone().requires_grad_() for tensor in scene.parameters()]
-    with pytest.raises(InputError, match=r"'manual' is the derivative of the Gaussian, and options.falloff is another"):
-        rasterize(*leaves, scene.camera, options=OPTIONS)
+    refusal(lambda: rasterize(*leaves, scene.camera, options=OPTIONS), "'manual' is the derivative of the Gaussian")
     image = rasterize(*scene.parameters(), scene.camera, options=OPTIONS).image
     assert torch.equal(image, rasterize(*leaves, scene.camera, adjoint="stored", options=OPTIONS).image)
 
@@ -86,10 +84,7 @@ def drawn(**options):
         (lambda: Falloff(reach, reach), "Falloff.fall: expected a wp.func of one Any"),
         (lambda: Falloff(fall, 3.0), "Falloff.reach: expected a wp.func of one float, got 3.0"),
         (lambda: drawn(falloff="wide"), r"options\.falloff: expected a warp_splat.Falloff or None, got 'wide'"),
-        (
-            lambda: drawn(falloff=Falloff(misspelled, reach)),
-            r'options\.falloff: .* function "misspelled" .* see docs/extending.md\.$',
-        ),
+        (lambda: drawn(falloff=Falloff(misspelled, reach)), r'falloff: .* function "misspelled" .*/extending.md\.$'),
     ],
 )
 def test_what_is_no_falloff_is_refused(make, message):
@@ -121,17 +116,14 @@ def too_near(x: float):
     [
         (heavy_tails, None),
         (Falloff(doubled, reach), "options.falloff.fall: expected 1 at q = 0, got 2;"),
-        (
-            Falloff(rising, reach),
-            "options.falloff.fall: expected a finite number, at most 1 as nearer to the mean, at q",
-        ),
+        (Falloff(rising, reach), "falloff.fall: expected a finite number, at most 1 as nearer to the mean, at q"),
         (Falloff(fall, too_near), "options.falloff.reach: expected the q where fall .* got 0.5 for x = 2, around"),
     ],
     ids=["right", "doubled", "rising", "too near"],
 )
 def test_what_is_none_is_found(falloff, message):
-    with pytest.raises(InputError, match=message) if message else nullcontext():
-        _check_falloff(falloff, torch.device("cpu"))
+    check = lambda: _check_falloff(falloff, torch.device("cpu"))  # noqa: E731
+    refusal(check, match=message) if message else check()
 
 
 def test_it_is_the_one_of_the_page():

@@ -32,13 +32,9 @@ from warp_splat.raster.project import project
 PRETENDING = {"cuda": f"{ROOT / 'tests/pretend_cuda'}:{ROOT}", "cpu": str(ROOT)}
 
 
-@pytest.fixture
-def fibers(monkeypatch):
-    monkeypatch.setattr(wp.config, "enable_cpu_blocks", True)
-
-
-def test_atomics_and_slots_give_the_gradients_of_the_product(fibers):
+def test_atomics_and_slots_give_the_gradients_of_the_product(monkeypatch):
     """Against autograd through the CPU's driver, which shares no kernel with them."""
+    monkeypatch.setattr(wp.config, "enable_cpu_blocks", True)
     gaussians = Gaussians(*(tensor.detach() for tensor in made_up.make_gaussians(3000, "cpu").activated()))
     camera = made_up.cameras(60, 40, 1)[0]
     blends = gpu_blends.Blends(gaussians, camera)

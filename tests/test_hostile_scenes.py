@@ -47,11 +47,6 @@ def with_mask(root):
     return [root / "masks" / "b.png"]
 
 
-def with_points(root):
-    write_transforms(root)
-    return [root / "points.ply"]
-
-
 #: Each makes a scene, and returns the files to change.
 KINDS = {
     "model": lambda root: colmap(root, MODEL),
@@ -59,7 +54,7 @@ KINDS = {
     "text model": lambda root: colmap(root, TEXT_MODEL, binary=False),
     "transforms": lambda root: [write_transforms(root, camera_model="OPENCV", k1=0.0) / "transforms.json"],
     "nerf-synthetic": lambda root: [write_blender(root, test=0) / "transforms_train.json"],
-    "points": with_points,
+    "points": lambda root: [write_transforms(root) / "points.ply"],
     "png": lambda root: with_image(root, "a.png"),
     "jpg": lambda root: with_image(root, "a.jpg"),
     "tif": lambda root: with_image(root, "a.tif"),
