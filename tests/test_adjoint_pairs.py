@@ -78,10 +78,7 @@ PIECES = {
     "times": ("simd.times(x, y)", lambda x, y, z: x * y),
     "fma": ("simd.fma(x, y, z)", lambda x, y, z: x * y + z),
     "over": ("simd.over(x, y)", lambda x, y, z: x / y),
-    "where_less": (
-        "simd.where_less(y, z, simd.times(x, x), simd.times(y, z))",
-        lambda x, y, z: np.where(y < z, x * x, y * z),
-    ),
+    "where_less": ("simd.where_less(y, z, x, simd.times(y, z))", lambda x, y, z: np.where(y < z, x, y * z)),
     "smaller": ("simd.smaller(simd.times(x, y), z)", lambda x, y, z: np.minimum(x * y, z)),
     "fraction": ("simd.fraction(x, simd.whole(y))", lambda x, y, z: x - np.trunc(y)),
     "negative": ("simd.negative(x)", lambda x, y, z: -x),

@@ -97,9 +97,8 @@ def test_splats_of_many_tiles(widths):
     """On CUDA a warp sums the rows of a splat together, if there are many; two runs give the same bits."""
     bins, slots, counts = crowded(70, sum(widths))
     with using(CUDA):
-        first, second = (
-            CUDA.gather(bins, slots, [torch.full((70, width), torch.nan) for width in widths]) for _ in range(2)
-        )
+        tables = [[torch.full((70, width), torch.nan) for width in widths] for _ in range(2)]
+        first, second = (CUDA.gather(bins, slots, table) for table in tables)
     owners = bins.gaussians.numpy().repeat(counts)
     expected = torch.zeros(70, sum(widths), dtype=torch.float64)
     expected.index_add_(0, torch.from_numpy(owners), slots[bins.places.long()].double())

@@ -35,6 +35,7 @@ from warp_splat.training.options import TrainConfig
 from warp_splat.training.record import finish, keep, restore, save_model
 from warp_splat.training.trainer import Trainer
 
+SLOW, LONG = pytest.mark.slow, pytest.mark.long
 STOP = 33  # of 60; densification has added Gaussians and the opacities were reset
 
 
@@ -248,10 +249,8 @@ def test_resume_of_a_start_from_a_file(gone, tmp_path, monkeypatch, capsys):
 
 def test_another_scene_is_refused(whole, tmp_path, fails):
     options = ["--resume", whole, "--iterations", "70", "-m", tmp_path / "a"]
-    assert (
-        "training views" in (said := fails("train", *options, "--no-eval"))
-        and "7 more, 0 fewer, such as view_000" in said
-    )
+    said = fails("train", *options, "--no-eval")
+    assert "training views" in said and "7 more, 0 fewer, such as view_000" in said
     assert str(tmp_path) in fails("train", *options, "-s", tmp_path)
     before = files_of(whole)
     fails("train", *options[:4], "--no-eval")
@@ -351,13 +350,11 @@ def run_main(arguments):
     sys.exit(main(arguments))
 
 
-@pytest.mark.parametrize(
-    ("most", "iterations"), [pytest.param(4, 60, marks=pytest.mark.slow), pytest.param(50, 300, marks=pytest.mark.long)]
-)
+@pytest.mark.parametrize(("most", "end"), [pytest.param(4, 60, marks=SLOW), pytest.param(50, 300, marks=LONG)])
 @forked
-def test_a_training_that_is_killed_again_and_again_ends_in_the_same_bytes(most, iterations, tmp_path):
+def test_a_training_that_is_killed_again_and_again_ends_in_the_same_bytes(most, end, tmp_path):
     """Killed at random moments, from first line to last picture; a checkpoint is written after every step."""
-    options = [*SHORT, "--iterations", str(iterations), "--checkpoint_interval", "0.00001"]
+    options = [*SHORT, "--iterations", str(end), "--checkpoint_interval", "0.00001"]
     assert train(tmp_path / "whole", *options) == 0
     moment, kills, runs, reached = random.Random(0), 0, 0, 0
     while True:
@@ -374,7 +371,7 @@ def test_a_training_that_is_killed_again_and_again_ends_in_the_same_bytes(most, 
                 assert reached >= before
             continue
         assert process.exitcode == 0
-        assert ply_path(folder, iterations).read_bytes() == ply_path(tmp_path / "whole", iterations).read_bytes()
+        assert ply_path(folder, end).read_bytes() == ply_path(tmp_path / "whole", end).read_bytes()
         if kills == most:
             break
         runs, reached = runs + 1, 0

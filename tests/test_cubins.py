@@ -6,6 +6,7 @@ import cubins
 import pytest
 from commands import ROOT
 
+SM_90, OTHERS = pytest.param(90, marks=pytest.mark.slow), (75, 80, 86, 89, 100, 120)
 KEYS = ("registers", "static_shared", "dynamic_shared", "loop")
 
 
@@ -13,13 +14,7 @@ RECORDED = json.loads((ROOT / "docs/cuda/cubins.json").read_text())  # by ``benc
 
 
 @pytest.mark.skipif(cubins.cuobjdump() is None, reason="cuobjdump is missing (it comes with triton, torch's on Linux)")
-@pytest.mark.parametrize(
-    "arch",
-    [
-        pytest.param(90, marks=pytest.mark.slow),
-        *(pytest.param(arch, marks=pytest.mark.long) for arch in (75, 80, 86, 89, 100, 120)),
-    ],
-)
+@pytest.mark.parametrize("arch", [SM_90, *(pytest.param(arch, marks=pytest.mark.long) for arch in OTHERS)])
 def test_resources(arch):
     """Of what has changed since they were recorded; the rest would be compiled to the same again."""
     before = {(record["module"], record["kernel"]): record for record in RECORDED["records"] if record["arch"] == arch}
@@ -42,9 +37,8 @@ def test_occupancy():
     """Worked by hand: 72 registers take 18432 of a block's 256 threads, 3 blocks of 65536, 768 of 2048 threads."""
     record = {"arch": 90, "threads": 256, "registers": 72, "static_shared": 2384, "dynamic_shared": 11312}
     assert cubins.occupancy(record) == pytest.approx(768 / 2048)
-    assert cubins.occupancy(record | {"threads": 32, "dynamic_shared": 0}) == pytest.approx(
-        28 * 32 / 2048
-    )  # blocks, by registers
+    small = record | {"threads": 32, "dynamic_shared": 0}
+    assert cubins.occupancy(small) == pytest.approx(28 * 32 / 2048)  # blocks, by registers
     assert cubins.occupancy(record | {"registers": 24, "dynamic_shared": 100_000}) == pytest.approx(512 / 2048)
 
 

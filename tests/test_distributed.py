@@ -22,6 +22,7 @@ from warp_splat.runtime.distributed import ALONE, GroupError, Processes, join
 from warp_splat.training.options import TrainConfig
 from warp_splat.training.trainer import Trainer
 
+SLOW, LONG = pytest.mark.slow, pytest.mark.long
 TORCHRUN = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
 
 
@@ -37,15 +38,12 @@ def gradients_of_ranks(trainers, iteration):
     return found
 
 
-@pytest.mark.parametrize(
-    "optimizer_type",
-    [pytest.param("default", marks=pytest.mark.slow), pytest.param("sparse_adam", marks=pytest.mark.long)],
-)
-def test_a_step_of_two_processes_is_one_of_their_mean_gradient(optimizer_type, scene, tmp_path):
+@pytest.mark.parametrize("kind", [pytest.param("default", marks=SLOW), pytest.param("sparse_adam", marks=LONG)])
+def test_a_step_of_two_processes_is_one_of_their_mean_gradient(kind, scene, tmp_path):
     """Against one process that differentiates both views, averages, and steps by Adam with the rates written out."""
-    assert together(2, ROOT / "tests" / "torchrun_steps.py", tmp_path, SCENE, optimizer_type)[0] == [0, 0]
+    assert together(2, ROOT / "tests" / "torchrun_steps.py", tmp_path, SCENE, kind)[0] == [0, 0]
     load = lambda rank, step, what: dict(np.load(tmp_path / f"rank{rank}_step{step}_{what}.npz"))  # noqa: E731
-    config = TrainConfig(optimizer_type=optimizer_type, **CONFIG)
+    config = TrainConfig(optimizer_type=kind, **CONFIG)
     trainers = [Trainer(scene, config, Pretended(rank, 2)) for rank in (0, 1)]
     moments = dict.fromkeys(trainers[0].model.NAMES, (0.0, 0.0))
     for step in range(1, STEPS + 1):
@@ -77,14 +75,8 @@ def test_a_step_of_two_processes_is_one_of_their_mean_gradient(optimizer_type, s
 def adam(config, extent, step, name, value, gradient, moments, shown):
     """A step in float64 for a batch of two: rates times sqrt(2), betas squared, epsilon over sqrt(2)."""
     decay = 0.01 ** (2 * step / 30_000)  # of the means' rate, in images
-    rates = {
-        "means": 0.00016 * extent * decay,
-        "sh_dc": 0.0025,
-        "sh_rest": 0.0025 / 20,
-        "opacities": 0.025,
-        "scales": 0.005,
-        "quats": 0.001,
-    }
+    rates = {"means": 0.00016 * extent * decay, "sh_dc": 0.0025, "sh_rest": 0.0025 / 20, "opacities": 0.025}
+    rates |= {"scales": 0.005, "quats": 0.001}
     beta1, beta2, sparse = 0.9**2, 0.999**2, config.learn.optimizer_type == "sparse_adam"
     mean = beta1 * moments[0] + (1 - beta1) * gradient
     square = beta2 * moments[1] + (1 - beta2) * gradient**2
@@ -107,7 +99,7 @@ def start(folder, *options):
     return run, {int(child.environ()["RANK"]): child for child in children}
 
 
-@pytest.mark.parametrize("killed", [pytest.param(0, marks=pytest.mark.long), pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("killed", [pytest.param(0, marks=LONG), pytest.param(1, marks=SLOW)])
 def test_when_a_process_is_killed_the_other_saves_and_stops(killed, tmp_path):
     run, ranks = start(tmp_path)
     ranks[killed].kill()
@@ -178,10 +170,10 @@ sys.exit(main(["train", *sys.argv[1:], *(OPTIONS if os.environ["RANK"] == "1" el
 @pytest.mark.parametrize(
     ("options", "found"),
     [
-        pytest.param(["--seed", "3"], "the same seed as of process 0, 0, got 3", marks=pytest.mark.slow),
-        pytest.param(["--no-shard"], "the same shard as of process 0, True, got False", marks=pytest.mark.long),
-        pytest.param(["-r", "4"], "the same resolution as of process 0, 8, got 4", marks=pytest.mark.long),
-        pytest.param(["--save_iterations", "5"], "the same save_iterations as", marks=pytest.mark.long),
+        pytest.param(["--seed", "3"], "the same seed as of process 0, 0, got 3", marks=SLOW),
+        pytest.param(["--no-shard"], "the same shard as of process 0, True, got False", marks=LONG),
+        pytest.param(["-r", "4"], "the same resolution as of process 0, 8, got 4", marks=LONG),
+        pytest.param(["--save_iterations", "5"], "the same save_iterations as", marks=LONG),
     ],
 )
 def test_other_options_of_a_process_are_told_before_the_first_step(options, found, tmp_path):
@@ -198,12 +190,10 @@ def test_other_options_of_a_process_are_told_before_the_first_step(options, foun
 def test_a_whole_run_of_two_processes(tmp_path):
     """The options of test_train.py's short run, and every part that learns; after every densification the models, and
     what the parts learned, are checked to be identical."""
-    options = (
-        "--eval -r 8 --iterations 59 --densify_from_iter 10 --densification_interval 10 --densify_until_iter 50 "
-        "--test_iterations 2 38 "
-    )
-    options += "--parts sky,exposure,pose,depth,floaters --exposure affine --vignetting --pose_intrinsics focal "
-    options += "--opacity_reset_interval 40 --sh_interval 15 --densify_grad_threshold 0.00005 --profile 10"
+    options = "--eval -r 8 --iterations 59 --densify_from_iter 10 --densification_interval 10 --densify_until_iter 50 "
+    options += "--profile 10 --parts sky,exposure,pose,depth,floaters --exposure affine --vignetting "
+    options += "--pose_intrinsics focal --opacity_reset_interval 40 --sh_interval 15 --densify_grad_threshold 0.00005"
+    options += " --test_iterations 2 38"
     ends, said = together(2, ROOT / "train.py", "-s", SCENE, "-m", tmp_path, *options.split())
     assert ends == [0, 0] and said.count("Done after 60 iterations") == 1 and "all-reduce" in said
     entry = json.loads((tmp_path / "results.json").read_text())["ours_60"]  # 59 rounded up to whole steps
@@ -248,9 +238,8 @@ def test_schedules_count_images(scene):
     for count in (1, 2, 3, 7):
         group = Pretended(0, count)
         ends = range(count, 1000, count)
-        assert [end for end in ends if group.reaches(end, [100, 550])] == [
-            -(-mark // count) * count for mark in (100, 550)
-        ]
+        due = [-(-mark // count) * count for mark in (100, 550)]
+        assert [end for end in ends if group.reaches(end, [100, 550])] == due
     config = TrainConfig(device="cpu", densify_from_iter=50, densification_interval=100, densify_until_iter=700)
     for count in (1, 2, 3, 7):
         densifier, due = Trainer(scene, config, Pretended(0, count)).growth, []

@@ -52,7 +52,7 @@ def test_gltf_of_any_name_finds_its_buffer(tmp_path, name):
 
 
 def place(tmp_path, nodes, **more):
-    """A file whose mesh stands where ``nodes`` say."""
+    """A file b.glb whose mesh stands where ``nodes`` say."""
     save_gaussians(tmp_path / "a.glb", file := some_file(10), report=silent)
     document, binary = glb_parts(tmp_path / "a.glb")
     (tmp_path / "b.glb").write_bytes(glb_bytes({**document, "nodes": nodes, **more}, binary))

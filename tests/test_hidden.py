@@ -56,10 +56,8 @@ def half_hidden():
 def test_one_depth_for_all_is_a_scene_without_what_is_behind(mode, driver):
     """Image and gradients, by any adjoint, are those of the Gaussians in front alone."""
     (scene, surface, front), found = half_hidden(), []
-    for options, kept in (
-        (RasterOptions(depth=True, hidden_from=surface), slice(None)),
-        (RasterOptions(depth=True), front),
-    ):
+    for hides, kept in ((surface, slice(None)), (None, front)):
+        options = RasterOptions(depth=True, hidden_from=hides)
         leaves = [tensor.clone().requires_grad_() for tensor in scene.parameters()]
         out = warp_splat.rasterize(*(leaf[kept] for leaf in leaves), scene.camera, scene.background, mode, options)
         weights = torch.linspace(0, 1, out.image.numel()).view_as(out.image)

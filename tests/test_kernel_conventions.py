@@ -26,9 +26,8 @@ def find_kernels():
         text = path.read_text()
         for node in ast.walk(ast.parse(text)):
             if is_kernel(node):
-                yield pytest.param(
-                    text.splitlines(), node, id=f"{path.relative_to(KERNELS).with_suffix('')}:{node.name}"
-                )
+                place = path.relative_to(KERNELS).with_suffix("")
+                yield pytest.param(text.splitlines(), node, id=f"{place}:{node.name}")
 
 
 FOUND = list(find_kernels())
@@ -45,10 +44,9 @@ def base_of(target):
 def written(kernel):
     """Variables of which elements are assigned."""
     for node in ast.walk(kernel):
-        targets = (
-            node.targets if isinstance(node, ast.Assign) else [node.target] if isinstance(node, ast.AugAssign) else []
-        )
-        yield from (base_of(target) for target in targets if isinstance(target, ast.Subscript))
+        if isinstance(node, ast.Assign | ast.AugAssign):
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            yield from (base_of(target) for target in targets if isinstance(target, ast.Subscript))
 
 
 def parameters(kernel):

@@ -49,9 +49,8 @@ def module_of(path: Path) -> str:
 def imported(path: Path):
     """The dotted name of each import that runs."""
     tree = ast.parse(path.read_text())
-    typing_only = [
-        node for node in ast.walk(tree) if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test)
-    ]
+    branches = [node for node in ast.walk(tree) if isinstance(node, ast.If)]
+    typing_only = [node for node in branches if "TYPE_CHECKING" in ast.dump(node.test)]
     skipped = {id(inner) for node in typing_only for inner in ast.walk(node)}
     for node in ast.walk(tree):
         if id(node) in skipped or not isinstance(node, ast.ImportFrom | ast.Import):
@@ -72,9 +71,8 @@ def test_imports_point_downwards(path):
         package, _, module = name.partition(".")
         if package != "warp_splat":
             assert not (level == 0 and package in ("torch", "warp", "numpy")), f"{path}: standard library only"
-            assert not (package == "torch" and "kernels" in path.relative_to(PACKAGE).parts), (
-                f"{path}: kernels never see torch"
-            )
+            in_kernels = "kernels" in path.relative_to(PACKAGE).parts
+            assert not (package == "torch" and in_kernels), f"{path}: kernels never see torch"
         elif module and not module.startswith("__"):
             assert layer_of(module) <= level, f"{path.name} (layer {level}) imports {name} (layer {layer_of(module)})"
 

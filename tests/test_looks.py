@@ -15,9 +15,8 @@ def features(order):
     """A walk: of each photograph, features that its neighbors share, in an ``order`` of the photographs' places."""
     random = np.random.default_rng(1)
     world = random.gamma(0.5, 40.0, (COUNT * STEP + SEEN, DISTINCT))
-    return lambda index: np.clip(
-        world[order[index] * STEP :][:SEEN] + random.normal(0, 6, (SEEN, DISTINCT)), 0, 255
-    ).astype(np.uint8)
+    noisy = lambda rows: rows + random.normal(0, 6, rows.shape)  # noqa: E731
+    return lambda index: noisy(world[order[index] * STEP :][:SEEN]).clip(0, 255).astype(np.uint8)
 
 
 def overlapping(order):

@@ -172,6 +172,7 @@ def test_what_is_not_finite_spreads_alike_on_any_number_of_threads(value, thread
 
 
 IMAGE, MASK = torch.zeros(20, 30, 3), torch.ones(20, 30, 1, dtype=torch.uint8)
+SHAPES = ((20, 30), (20, 30, 4), (21, 30, 3), (1, 1, 3))
 
 
 @pytest.mark.parametrize(
@@ -189,11 +190,7 @@ IMAGE, MASK = torch.zeros(20, 30, 3), torch.ones(20, 30, 1, dtype=torch.uint8)
         ((IMAGE, None), "two tensors.*NoneType"),
         *(((IMAGE, IMAGE, share), "lambda_dssim.*0 to 1") for share in (-0.1, 1.1, float("nan"), "x")),
         ((IMAGE[:0], IMAGE[:0]), r"1 x 1 or more.*\[0, 30, 3\]"),
-        *(
-            ((IMAGE, torch.zeros(shape), 0.2, mask), r"\[H, W, 3\]")
-            for shape in ((20, 30), (20, 30, 4), (21, 30, 3), (1, 1, 3))
-            for mask in (None, MASK)
-        ),
+        *(((IMAGE, torch.zeros(shape), 0.2, mask), r"\[H, W, 3\]") for shape in SHAPES for mask in (None, MASK)),
     ],
 )
 def test_what_is_refused(arguments, said):

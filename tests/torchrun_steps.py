@@ -17,14 +17,8 @@ from warp_splat.training.trainer import Trainer
 
 STEPS = 3
 #: Densifies after the third step, before which each process has seen other views.
-CONFIG = {
-    "device": "cpu",
-    "densify_from_iter": 4,
-    "densification_interval": 6,
-    "sh_interval": 4,
-    "random_background": True,
-    "parts": "floaters",
-}
+CONFIG = {"device": "cpu", "densify_from_iter": 4, "densification_interval": 6, "sh_interval": 4}
+CONFIG |= {"random_background": True, "parts": "floaters"}
 
 
 def arrays(tensors) -> dict[str, np.ndarray]:

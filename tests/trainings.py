@@ -11,16 +11,9 @@ from warp_splat.training.record import Run, keep, restore
 from warp_splat.training.trainer import Trainer
 
 #: Densifies, prunes, resets opacities and raises the SH degree within 50 steps.
-SCHEDULE = {
-    "device": "cpu",
-    "iterations": 50,
-    "densify_from_iter": 10,
-    "densification_interval": 10,
-    "densify_until_iter": 45,
-    "opacity_reset_interval": 20,
-    "sh_interval": 15,
-    "densify_grad_threshold": 0.00005,
-}
+SCHEDULE = {"device": "cpu", "iterations": 50, "sh_interval": 15, "opacity_reset_interval": 20}
+SCHEDULE |= {"densify_from_iter": 10, "densify_until_iter": 45, "densification_interval": 10}
+SCHEDULE |= {"densify_grad_threshold": 0.00005}
 
 
 class Pretended(Processes):
