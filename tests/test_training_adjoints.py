@@ -4,9 +4,11 @@ import csv
 import json
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import training_adjoints as trained
 
+from warp_splat.config import ADJOINTS
 from warp_splat.presets import EMBEDDED_DEFAULTS
 from warp_splat.scene import load_scene
 from warp_splat.scene.embedded import embedded_scene
@@ -60,6 +62,18 @@ def test_run_writes_its_files(tiny, scene, tmp_path):
     assert float(of["manual"]["longest_list"]) < 2048  # a cap that no list reaches changes nothing
     assert of["cap 2048"]["psnr"] == of["cap 2048, rendering only"]["psnr"] == of["manual"]["psnr"]
     assert float(of["cap 128"]["lists_cut"]) > 0
+
+
+def test_modes_train_alike(scene, monkeypatch):
+    monkeypatch.setattr(trained, "EVALUATIONS", STEPS)
+    monkeypatch.setattr(trained, "COMPARED", ())
+    losses = []
+    for mode in ADJOINTS:
+        trainer = trained.make_trainer(scene, {**SCHEDULE, "densify_until_iter": 0}, 0, adjoint=mode)
+        list(trained.train_run(trainer, result := trained.Trained("", mode, 0), {}))
+        losses.append([record["loss"] for record in result.history])
+    assert np.mean(losses[0][-5:]) < 0.9 * np.mean(losses[0][:5])
+    np.testing.assert_allclose(losses[1:], [losses[0]] * 3, rtol=1e-3)
 
 
 def test_cap_of_one_entry_costs_quality(scene):
