@@ -165,7 +165,8 @@ def test_photographs_that_have_become_linear(tmp_path, ran, fails):
         photo.unlink()
     assert "expected photographs not in linear light, as" in fails("train", "--resume", model, "--iterations", "4")
     begun = ran("train", "-s", root, "-m", tmp_path / "new", "--start_ply", model, "--iterations", "1")
-    assert f"If {model} is not, its colors start too bright" in begun
+    assert f"only one of {model} and the photographs is said to be in linear light" in begun
+    assert "expected a scene not in linear light" in fails("simplify", model, "-s", root, "--keep", "0.5")
 
 
 def write_exr(path, channels, size=(WIDTH, HEIGHT)):
@@ -177,7 +178,10 @@ def write_exr(path, channels, size=(WIDTH, HEIGHT)):
     assert file.open(str(path), spec) and file.write_image(pixels) and file.close()
 
 
-@pytest.mark.parametrize(("channels", "found"), [("A Z", 1e30), ("B G R Z", 1e30), ("Y", 0.125), ("V A", 0.125)])
+EXR_NUMBERS = {"A Z": 1e30, "B G R Z": 1e30, "Y": 0.125, "V A": 0.125, "a.R a.Z": 0.25}
+
+
+@pytest.mark.parametrize(("channels", "found"), EXR_NUMBERS.items())
 def test_numbers_of_an_exr_are_those_of_z(tmp_path, channels, found):
     write_exr(tmp_path / "a.exr", channels.split())
     assert (read_numbers(tmp_path / "a.exr") == np.float32(found)).all()

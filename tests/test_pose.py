@@ -166,7 +166,7 @@ def test_a_photograph_is_found_while_the_model_stays(linear):
     turn = Rotation.from_rotvec([0.01, 0.01, -0.01]).as_matrix()
     start = replace(right, rotation=turn, translation=right.translation - 0.012)
     *others, sh = gaussians
-    where = where_taken(Gaussians(*others, sh[:, :1], sh[:, 1:]), torch.zeros(3), RasterOptions(), 1.0, exposed)
+    where = where_taken(Gaussians(*others, sh[:, :1], sh[:, 1:]), torch.zeros(3), RasterOptions(), 1.0, exposed, linear)
     camera = where(View("a.png", start, Decoded(photo), start))
     degrees, meters, focal = made_cameras.distance(camera, right)
     assert degrees < 0.05 and meters < 1e-3 and focal == 0
@@ -177,7 +177,7 @@ def test_a_model_that_shows_nothing_leads_nowhere_far():
     camera = made_cameras.looking()
     white = np.full((camera.height, camera.width, 3), 255, np.uint8)
     start = View("a.png", camera, Decoded(white), camera)
-    found = find_pose(lambda learned: (learned.twist[0] / 100).float().expand(*white.shape), start, 1.0)
+    found = find_pose(lambda learned: (learned.twist[0] / 100).float().expand(*white.shape), start, 1.0, False)
     degrees, meters, _ = made_cameras.distance(found, camera)
     assert degrees == pytest.approx(np.degrees(alignment.FARTHEST)) and meters < 1e-9
 

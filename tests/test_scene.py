@@ -8,7 +8,6 @@ import pycolmap
 import pytest
 import scene_files
 from commands import FOX, python
-from hostile import refusal
 from scene_files import HEIGHT, POINTS, WIDTH, distorted_picture, load, texture, thin_prism, write_blender, write_colmap
 
 from warp_splat import Camera, InputError
@@ -299,10 +298,11 @@ def test_blender_splits(tmp_path):
     assert [[view.name for view in views] for views in (scene.train, scene.test)] == names
 
 
-def test_blender_with_training_photographs_in_its_test_file(tmp_path):
+def test_blender_with_training_photographs_in_its_test_file(tmp_path, fails):
     root = write_blender(tmp_path, train=3, test=2)
     (root / "transforms_test.json").write_bytes((root / "transforms_train.json").read_bytes())
-    refusal(lambda: load(root, eval=True), "photographs that do not train", "3 in both lists", "r_0.png", "--eval")
+    message = fails("train", "-s", root, "-m", tmp_path / "model", "--eval")
+    assert "train/r_0.png is in two; mend" in message
 
 
 def test_blender_without_test_file(tmp_path):

@@ -59,10 +59,9 @@ class Camera:
     shutter: Shutter | None = None
 
     def __post_init__(self):
-        for name in (*NUMBERS, "rotation", "translation"):
-            if getattr(getattr(self, name), "requires_grad", False):  # it would get none
-                raise InputError(f"Camera {name}: expected numbers, got a tensor that wants a gradient; detach it.")
         for name, (expected, fits, kind) in NUMBERS.items():
+            if getattr(getattr(self, name), "requires_grad", False):  # it would get none
+                raise InputError(f"Camera {name}: expected a number, got a tensor that wants a gradient; detach it.")
             try:
                 value = float(getattr(self, name))
             except (TypeError, ValueError, OverflowError) as error:
@@ -73,7 +72,7 @@ class Camera:
         for name, shape in (("rotation", (3, 3)), ("translation", (3,))):
             try:
                 value = np.array(getattr(self, name), dtype=np.float64)
-            except (TypeError, ValueError) as error:
+            except (TypeError, ValueError, RuntimeError) as error:  # torch's, of a tensor that wants a gradient
                 raise InputError(f"Camera {name}: expected numbers of shape {shape}, got something else.") from error
             if value.shape != shape:
                 raise InputError(f"Camera {name}: expected shape {shape}, got {value.shape}.")

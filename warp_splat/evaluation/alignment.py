@@ -21,24 +21,25 @@ STEPS = 40  # pictures and their adjoints, about: an iteration that has begun is
 
 
 def where_taken(
-    gaussians: Gaussians, background: torch.Tensor, options: RasterOptions, extent: float, finish: Finish
+    gaussians: Gaussians, background: torch.Tensor, options: RasterOptions, extent: float, finish: Finish, linear: bool
 ) -> Callable[[View], Camera]:
     """A function from a view to the camera that :func:`find_pose` finds for it.
 
-    ``finish``: what makes an image [H, W, 3] as a photograph shows it, by its name.
+    ``finish``: what makes an image [H, W, 3] as a photograph shows it, by its name. ``linear``: in linear light.
     """
     gaussians = Gaussians(*(tensor.detach() for tensor in gaussians))
     draw = lambda camera, name: finish(render(gaussians, camera, background, options).image, name)  # noqa: E731
-    return lambda view: find_pose(lambda camera: draw(camera, view.name), view, extent)
+    return lambda view: find_pose(lambda camera: draw(camera, view.name), view, extent, linear)
 
 
-def find_pose(draw: Callable[[CameraParameters], torch.Tensor], view: View, extent: float) -> Camera:
+def find_pose(draw: Callable[[CameraParameters], torch.Tensor], view: View, extent: float, linear: bool) -> Camera:
     """The camera from which the model looks most like the photograph, on a screen, by L-BFGS near where it was given.
 
     Args:
         draw: the image [H, W, 3] as the photograph shows it, through a camera, with gradients for that.
         view: the photograph; where it has a mask, the rest does not count.
         extent: size of the scene, world units.
+        linear: whether ``draw``'s images are in linear light.
     """
     camera = view.camera
     units = torch.tensor([1.0] * 3 + [extent] * 3, dtype=torch.float64)
@@ -48,7 +49,7 @@ def find_pose(draw: Callable[[CameraParameters], torch.Tensor], view: View, exte
     def loss(numbers: np.ndarray) -> tuple[float, np.ndarray]:
         twist = torch.from_numpy(numbers).requires_grad_()
         image = draw(CameraParameters(camera, twist * units))
-        image = to_srgb(image.clamp(0.0, 1.0), torch.where) if view.linear else image
+        image = to_srgb(image.clamp(0.0, 1.0), torch.where) if linear else image
         difference = ((image - photo.to(image.device)) * mask.to(image.device)).permute(2, 0, 1)
         levels = [level for level in LEVELS if level <= min(difference.shape[1:])]
         errors = torch.stack([avg_pool2d(difference, level).square().mean() for level in levels]).sum()

@@ -6,6 +6,7 @@ hold. No other files are opened than buffers in the folder of the .gltf file or 
 Own code, plain JSON and NumPy: the libraries for glTF build objects from the JSON without checking it.
 """
 
+import os
 import struct
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -125,7 +126,7 @@ class Document:
         if not isinstance((uri := entry["uri"]), str) or uri.startswith("data:"):
             raise Unexpected("a buffer inside the JSON; export it as .glb, or with a .bin file")
         folder = self.path.parent.resolve()
-        path = (folder / unquote(uri, errors="surrogateescape")).resolve()  # a null byte raises ValueError
+        path = Path(os.path.realpath(folder / unquote(uri, errors="surrogateescape")))  # a null byte raises ValueError
         if "://" in uri or "\\" in uri or not path.is_relative_to(folder):
             raise Unexpected(f"a buffer outside of its folder ({uri!r:.80})")
         if not path.is_file():

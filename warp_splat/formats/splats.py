@@ -168,11 +168,11 @@ def concatenated(parts: Sequence[SplatArrays]) -> SplatArrays:
     return SplatArrays(*(np.concatenate(arrays) for arrays in zip(*padded, strict=True)))
 
 
-def of_parts(path, parts: Sequence[SplatArrays], mip: Sequence[bool], notes: list[str], report: Report) -> SplatFile:
-    """The Gaussians of a file's parts, of which ``mip`` tells which are antialiased; ``report`` gets each note once."""
+def of_parts(path: object, parts: Sequence[SplatArrays], mip: list[bool], notes: list[str], say: Report) -> SplatFile:
+    """The Gaussians of a file's parts, of which ``mip`` tells which are antialiased; ``say`` gets each note once."""
     notes = [*notes, *[SOME_MIP] * (any(mip) and not all(mip))]
     for note in dict.fromkeys(notes):
-        report(f"{path}: {note}.")
+        say(f"{path}: {note}.")
     return SplatFile(concatenated(parts), all(mip))
 
 

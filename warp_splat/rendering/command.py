@@ -147,8 +147,9 @@ def render_model(config: RenderConfig) -> int:
                 certify(train, written)
             if test:
                 extra = {"split": "test", "gaussians": len(model)}
-                finish, behind = partial(as_photographed, finished.exposures), finished.background(device)
-                where = where_taken(activated, behind, options, given.extent, finish) if scene is not given else None
+                seen = activated, finished.background(device), options, given.extent
+                finish = partial(as_photographed, finished.exposures), finished.is_linear(scene)
+                where = where_taken(*seen, *finish) if scene is not given else None
                 means, compared = evaluate_views(picture, test, folder, "test", iteration, extra, metrics, where)
                 show_views(compared, folder, "test", iteration, say)
                 print(f"  test   {len(test)} views in {folder / 'test' / f'ours_{iteration}'}")

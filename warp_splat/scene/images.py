@@ -115,9 +115,9 @@ def read_exposure(path: Path) -> float | None:
 def same_shape(size: tuple[int, int], other: tuple[int, int]) -> bool:
     """Whether one size is the other times a factor, up to the rounding of either side to whole pixels.
 
-    No size is below a 64th of the ``other``: rounded to a pixel or two, all are alike.
+    Not if it has fewer than 4 px: rounded to that, all are alike.
     """
-    return abs(size[0] * other[1] - size[1] * other[0]) < other[0] + other[1] <= 64 * sum(size)
+    return abs(size[0] * other[1] - size[1] * other[0]) < other[0] + other[1] and min(size) >= min(4, *other)
 
 
 def require_shape(path: Path, kind: str, found: tuple[int, ...], size: tuple[int, int], advice: str) -> None:
@@ -212,8 +212,8 @@ def read_numbers(path: Path) -> np.ndarray:
     file = _open(path)
     if (kind := file.spec().format).basetype not in (*FLOATS, oiio.BASETYPE.UINT16):
         raise InputError(f"{path}: expected numbers of 16 bits or floats, found {kind}; save it as 16-bit PNG or EXR.")
-    names = [name.upper() for name in file.spec().channelnames]
-    first = min(range(len(names)), key=lambda place: (names[place] != "Z", names[place] == "A"))
+    spec = file.spec()
+    first = min(range(spec.nchannels), key=lambda place: (place != spec.z_channel, place == spec.alpha_channel))
     numbers = _decoded(path, file, 0, 0, first, first + 1, oiio.FLOAT if kind.basetype in FLOATS else oiio.UINT16)
     return numbers[..., 0] / (1.0 if kind.basetype in FLOATS else 2.0**16)
 

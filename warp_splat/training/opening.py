@@ -131,11 +131,13 @@ def open_scene(config: TrainConfig, begun: Checkpoint | None, say: Report, proce
     if begun:
         folder = begun.path.parent
         scene.refuse_other_frame(folder, read_coordinates(folder))
-        before = model_folder.read_cfg_args(folder) if (folder / "cfg_args").exists() else {}
-        if bool(before.get("linear_light", scene.linear)) != scene.linear:
+        told = f"linear_light={not scene.linear}"
+        if (args := folder / "cfg_args").exists() and told in args.read_text("utf-8", "replace"):
             expected = f"expected photographs {'not ' * scene.linear}in linear light, as {folder} was trained on"
             raise InputError(f"{data.source_path}: {expected}, found others; name those of then (-s), or start anew.")
         return scene
+    if both := sorted({view.name for view in scene.train} & {view.name for view in scene.test}):
+        raise InputError(f"{data.source_path}: expected photographs in one list, {both[0]} is in two; mend them.")
     if scene.block and scene.block.empty:  # before blocks are trained that could not be merged
         which = f"none of block {scene.block.empty[0] + 1}"
         raise InputError(f"--block {data.block}: expected photographs of each, found {which}; take fewer blocks.")
@@ -149,9 +151,7 @@ def open_scene(config: TrainConfig, begun: Checkpoint | None, say: Report, proce
             which = "with" if scene.start.antialiased else "without"
             say(f"Warning: {start} was trained {which} --antialiasing; the same option keeps its sizes right.")
         if scene.start.linear != scene.linear:
-            dark = f"{start} is in linear light, and the photographs are not; its colors start too dark."
-            bright = f"the photographs are in linear light. If {start} is not, its colors start too bright."
-            say(f"Warning: {bright if scene.linear else dark}")
+            say(f"Warning: only one of {start} and the photographs is said to be in linear light; colors may be off.")
     return scene
 
 

@@ -349,7 +349,7 @@ class Trainer:
         if not having(self.parts, "refined") or not self.scene.test:
             return None
         seen = self.model.activated(self.degree), self.behind, self.options, self.scene.extent
-        return where_taken(*seen, partial(as_photographed, self.exposures))
+        return where_taken(*seen, partial(as_photographed, self.exposures), self.scene.linear)
 
     def evaluate(self, views: list[View]) -> float:
         """Mean PSNR [dB] of 8-bit renders against the photographs, as a screen shows both."""
