@@ -46,7 +46,7 @@ class Opened(Finished):
         require_some(self)
         self.scene = self.refined(self.load_scene(config.source_path, print))
         if (linear := self.scene.linear) != self.is_linear(self.scene):
-            raise InputError(f"{self.path}: expected a scene {'not ' * linear}in linear light, as it was; see -s.")
+            raise InputError(f"{self.path}: expected a scene {'not ' * linear}in linear light, as its own is (-s).")
         if found := self.scene.trained_among(self.path):
             print(f"{len(found)} photographs that are held out now, such as {found[0]}, were trained on: not used.")
             self.scene = replace(self.scene, test=[view for view in self.scene.test if view.name not in found])
