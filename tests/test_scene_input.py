@@ -192,6 +192,7 @@ def test_a_name_that_is_no_utf_8_gets_a_sentence(tmp_path):
 
 def test_a_photograph_of_a_pixel_is_no_smaller_copy():
     assert same_shape((5, 8), (266, 474)) and not same_shape((1, 1), (266, 474))
+    assert same_shape((4, 3), (400, 300)) and same_shape((1, 1), (3, 3))  # a mask of a few pixels
 
 
 @pytest.mark.parametrize("words", [("train", "-m", "new", "-s"), ("inspect",), ("sfm", SCENE / "images")])

@@ -115,9 +115,9 @@ def read_exposure(path: Path) -> float | None:
 def same_shape(size: tuple[int, int], other: tuple[int, int]) -> bool:
     """Whether one size is the other times a factor, up to the rounding of either side to whole pixels.
 
-    Not if it has fewer than 4 px: rounded to that, all are alike.
+    Of fewer than 4 px, only what needs no rounding is: rounded to that, all are alike.
     """
-    return abs(size[0] * other[1] - size[1] * other[0]) < other[0] + other[1] and min(size) >= min(4, *other)
+    return abs(size[0] * other[1] - size[1] * other[0]) < (sum(other) if min(size) >= min(4, *other) else 1)
 
 
 def require_shape(path: Path, kind: str, found: tuple[int, ...], size: tuple[int, int], advice: str) -> None:
@@ -204,16 +204,19 @@ def read_mask(path: Path, size: tuple[int, int], invert: bool) -> np.ndarray:
 
 
 def read_numbers(path: Path) -> np.ndarray:
-    """Channel Z of a file, or the first beside alpha, [H, W]: floats as they are, 16-bit numbers as shares of 65536.
+    """Numbers of a file [H, W] float64: floats as they are, those of 16 bits as shares of 65536.
+
+    Of several channels Z, or one that is named depth, else the first beside alpha.
 
     Raises:
         InputError: if it has neither, or is not an image that OpenImageIO reads.
     """
     file = _open(path)
-    if (kind := file.spec().format).basetype not in (*FLOATS, oiio.BASETYPE.UINT16):
-        raise InputError(f"{path}: expected numbers of 16 bits or floats, found {kind}; save it as 16-bit PNG or EXR.")
     spec = file.spec()
-    first = min(range(spec.nchannels), key=lambda place: (place != spec.z_channel, place == spec.alpha_channel))
+    if (kind := spec.format).basetype not in (*FLOATS, oiio.BASETYPE.UINT16):
+        raise InputError(f"{path}: expected numbers of 16 bits or floats, found {kind}; save it as 16-bit PNG or EXR.")
+    depths = [(name != "Z", "depth" not in name.lower()) for name in spec.channelnames]
+    first = min(range(len(depths)), key=lambda place: (*depths[place], place == spec.alpha_channel))
     numbers = _decoded(path, file, 0, 0, first, first + 1, oiio.FLOAT if kind.basetype in FLOATS else oiio.UINT16)
     return numbers[..., 0] / (1.0 if kind.basetype in FLOATS else 2.0**16)
 
