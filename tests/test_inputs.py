@@ -178,7 +178,16 @@ def write_exr(path, channels, size=(WIDTH, HEIGHT)):
     assert file.open(str(path), spec) and file.write_image(pixels) and file.close()
 
 
-EXR_NUMBERS = {"A Z": 1e30, "B G R Z": 1e30, "Y": 0.125, "V A": 0.125, "a.R depth.Z": 0.25, "R normal.Z": 0.125}
+EXR_NUMBERS = {
+    "A Z": 1e30,
+    "B G R Z": 1e30,
+    "Y": 0.125,
+    "V A": 0.125,
+    "a.R depth.Z": 0.25,
+    "R normal.Z": 0.125,
+    "R z": 0.25,
+    "R depth_std Depth": 0.375,
+}
 
 
 @pytest.mark.parametrize(("channels", "found"), EXR_NUMBERS.items())

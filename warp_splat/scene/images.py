@@ -206,7 +206,7 @@ def read_mask(path: Path, size: tuple[int, int], invert: bool) -> np.ndarray:
 def read_numbers(path: Path) -> np.ndarray:
     """Numbers of a file [H, W] float64: floats as they are, those of 16 bits as shares of 65536.
 
-    Of several channels Z, or one that is named depth, else the first beside alpha.
+    Of several channels Z, or one that ends in depth, else the first beside alpha.
 
     Raises:
         InputError: if it has neither, or is not an image that OpenImageIO reads.
@@ -215,8 +215,8 @@ def read_numbers(path: Path) -> np.ndarray:
     spec = file.spec()
     if (kind := spec.format).basetype not in (*FLOATS, oiio.BASETYPE.UINT16):
         raise InputError(f"{path}: expected numbers of 16 bits or floats, found {kind}; save it as 16-bit PNG or EXR.")
-    depths = [(name != "Z", "depth" not in name.lower()) for name in spec.channelnames]
-    first = min(range(len(depths)), key=lambda place: (*depths[place], place == spec.alpha_channel))
+    names = [(n != "z", not n.endswith(("depth", "depth.z", "depth.v"))) for n in map(str.lower, spec.channelnames)]
+    first = min(range(len(names)), key=lambda place: (*names[place], place == spec.alpha_channel))
     numbers = _decoded(path, file, 0, 0, first, first + 1, oiio.FLOAT if kind.basetype in FLOATS else oiio.UINT16)
     return numbers[..., 0] / (1.0 if kind.basetype in FLOATS else 2.0**16)
 

@@ -131,7 +131,7 @@ def open_scene(config: TrainConfig, begun: Checkpoint | None, say: Report, proce
     if begun:
         folder = begun.path.parent
         scene.refuse_other_frame(folder, read_coordinates(folder))
-        if (args := folder / "cfg_args").exists() and f"linear_light={not scene.linear}".encode() in args.read_bytes():
+        if (args := folder / "cfg_args").is_file() and f"linear_light={not scene.linear}".encode() in args.read_bytes():
             expected = f"expected photographs {'not ' * scene.linear}in linear light, as {folder} was trained on"
             raise InputError(f"{data.source_path}: {expected}, found others; name those of then (-s), or start anew.")
         return scene
