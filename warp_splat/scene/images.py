@@ -204,7 +204,7 @@ def read_mask(path: Path, size: tuple[int, int], invert: bool) -> np.ndarray:
 
 
 def read_numbers(path: Path) -> np.ndarray:
-    """Numbers of a file [H, W] float64: floats as they are, those of 16 bits as shares of 65536.
+    """Numbers of a file [H, W]: floats as they are, those of 16 bits as shares of 65536.
 
     Of several channels Z, or one that ends in depth, else the first beside alpha.
 
