@@ -161,7 +161,7 @@ def ended_while_it_writes(number, *arguments):
     sys.exit(main([*arguments]))
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_leaves_no_part_of_a_file(tmp_path, number):
     save_gaussians(tmp_path / "a.ply", some_file(9))
     process = forked_process(ended_while_it_writes, number, "convert", f"{tmp_path}/a.ply", f"{tmp_path}/b.ply")

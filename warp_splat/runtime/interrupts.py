@@ -22,17 +22,23 @@ def _handling(numbers: Sequence[int], handler: Callable) -> Iterator[None]:
             signal.signal(number, before)
 
 
+def _ending() -> list[int]:
+    """What ends a process by default: SIGTERM, and SIGHUP of a terminal that is closed, unless nohup has it ignored."""
+    there = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]  # Windows has no SIGHUP
+    return [number for number in there if signal.getsignal(number) != signal.SIG_IGN]
+
+
 @contextmanager
 def interruptible() -> Iterator[list[int]]:
-    """Yield a list that Ctrl-C (and SIGTERM) adds to, instead of raising: the block looks at it when it can stop."""
+    """Yield a list that Ctrl-C (and what ends a process) adds to, instead of raising, for the block to look at."""
     interrupted: list[int] = []
-    with _handling((signal.SIGINT, signal.SIGTERM), lambda number, frame: interrupted.append(number)):
+    with _handling((signal.SIGINT, *_ending()), lambda number, frame: interrupted.append(number)):
         yield interrupted
 
 
 @contextmanager
 def later() -> Iterator[None]:
-    """Let Ctrl-C and SIGTERM come after the block: in libraries that are half loaded, exceptions become others."""
+    """Let Ctrl-C and its like come after the block: in libraries that are half loaded, exceptions become others."""
     with interruptible() as interrupted:
         yield
     for number in interrupted:  # for the handler of whoever loads them
@@ -40,11 +46,11 @@ def later() -> Iterator[None]:
 
 
 def ending_as_by_ctrl_c() -> AbstractContextManager[None]:
-    """Let SIGTERM raise as Ctrl-C does, so that what is half written goes, and what is measured is kept.
+    """Let SIGTERM and SIGHUP raise as Ctrl-C does, so that what is half written goes, and what is measured is kept.
 
     Not torchrun's: it would wait for a process that waits for another.
     """
-    return _handling((signal.SIGTERM,) * ("LOCAL_RANK" not in os.environ), signal.default_int_handler)
+    return _handling(_ending() * ("LOCAL_RANK" not in os.environ), signal.default_int_handler)
 
 
 def leaving_at_once() -> AbstractContextManager[None]:
