@@ -92,6 +92,7 @@ def put(trained, folder, *numbers):
         (folder / str(number) / BLOCK).write_text(json.dumps({**facts, "number": int(number)}))
 
 
+@pytest.mark.slow
 def test_a_merge_of_one_model_by_blocks_is_that_model(trained, tmp_path, capsys):
     """Whatever the cells are: nothing is lost, nothing comes twice. And render.py knows what to compare it with."""
     put(trained, tmp_path, 0, 1)

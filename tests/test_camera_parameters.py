@@ -183,6 +183,7 @@ def test_check_gradients_names_what_is_off(scene, index, entry, name, spoil):
     assert report.named("off") == [name] and report.worst is None, str(report)
 
 
+@pytest.mark.slow
 def test_a_camera_finds_its_way_back():
     """From 5 degrees, 10 cm and 5 % of its focal lengths, in a picture that the renderer drew."""
     angle, place, focal = cameras.recover(seed=1, steps=220)[-1]

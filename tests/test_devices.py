@@ -168,7 +168,7 @@ launch._stream("cuda")
 FIRST_ARRAY = 'from warp_splat.runtime import launch; launch.empty(3, float, "cpu")'
 
 
-@pytest.mark.parametrize("code", [FIRST_LAUNCH, FIRST_ARRAY])
+@pytest.mark.parametrize("code", [FIRST_LAUNCH, pytest.param(FIRST_ARRAY, marks=pytest.mark.slow)])
 def test_the_first_call_of_a_process_finds_warp_initialized(code):
     python("-c", code)
 

@@ -169,7 +169,8 @@ def test_a_signal_leaves_no_part_of_a_file(tmp_path, number):
     assert process.exitcode == 130 and [path.name for path in tmp_path.iterdir()] == ["a.ply"]
 
 
-@pytest.mark.parametrize("encoding", ["ascii", pytest.param("latin-1", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("encoding", ["ascii", "latin-1"])
 def test_a_name_that_a_terminal_cannot_say(tmp_path, encoding):
     save_gaussians(tmp_path / "a.ply", some_file(9))
     command = ["-m", "warp_splat", "convert", tmp_path / "a.ply", tmp_path / "漢.spz"]

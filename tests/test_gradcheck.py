@@ -18,11 +18,11 @@ VARIANTS = [
     ("degree2", RasterOptions(depth=True)),
     ("degree3", RasterOptions(projection="ellipsoid", depth=True)),
     ("subpixel", RasterOptions(antialiasing=True)),
-    ("needles", RasterOptions()),
+    pytest.param("needles", RasterOptions(), marks=pytest.mark.slow),
     ("opaque", RasterOptions(depth=True, antialiasing=True, projection="ellipsoid")),
     ("far_world", RasterOptions(alpha_min=0.0, t_min=0.0)),
-    ("dense_tile", RasterOptions(depth=True, extent="square")),
-    ("size_1x1", RasterOptions(bound=True)),
+    pytest.param("dense_tile", RasterOptions(depth=True, extent="square"), marks=pytest.mark.slow),
+    pytest.param("size_1x1", RasterOptions(bound=True), marks=pytest.mark.slow),
 ]
 
 
@@ -43,7 +43,9 @@ def test_right_gradients_agree(name, options):
     assert all(row.uncertainty < 5e-3 and row.pixels > 0.5 for row in report.rows), errors(report)
 
 
-@pytest.mark.parametrize("adjoint", [*ADJOINTS[1:], "generated"])
+@pytest.mark.parametrize(
+    "adjoint", [*ADJOINTS[2:], *(pytest.param(mode, marks=pytest.mark.slow) for mode in (ADJOINTS[1], "generated"))]
+)
 def test_every_mode_agrees(adjoint):
     report = check("degree1", adjoint=adjoint, options=RasterOptions(depth=True), parameters=EVERYTHING, directions=2)
     assert {row.verdict for row in report.rows} == {"agrees"}, errors(report)
@@ -81,10 +83,10 @@ def scaled(index, factor):
     ("function", "index", "factor", "named"),
     [
         (blend.Blend, 1, 1.05, {"conics", "quats", "scales"}),
-        (blend.Blend, 2, 1.01, {"opacities2d", "opacities"}),
+        pytest.param(blend.Blend, 2, 1.01, {"opacities2d", "opacities"}, marks=pytest.mark.slow),
         (blend.Blend, 5, None, {"background"}),
         (project.Project, 1, torch.tensor([1.0, 1.0, -1.0, 1.0]), {"quats"}),
-        (project.Project, 5, 0.0, {"sh"}),
+        pytest.param(project.Project, 5, 0.0, {"sh"}, marks=pytest.mark.slow),
         (project.Project, 0, float("nan"), {"means"}),
     ],
 )

@@ -166,13 +166,20 @@ def two_of_one_stem(path):
         (in_photo(lambda path: write_image(path, texture(264, 248, 4))), "warning alpha: 1 of 50"),
         (lambda s: write_image(s / "masks/view_003.png.png", texture(264, 248, 1)), "warning masks: masks for 1 of 50"),
         (lambda s: shutil.copytree(s / "sparse/0", s / "sparse/1"), "warning sub-models: sparse/1"),
-        (in_model(lambda model: [model.delete_point3D(n) for n in [*model.points3D]]), "warning points: random ones"),
+        pytest.param(
+            *(
+                in_model(lambda model: [model.delete_point3D(n) for n in [*model.points3D]]),
+                "warning points: random ones",
+            ),
+            marks=pytest.mark.slow,
+        ),
         (in_model(lambda model: setattr(model.cameras[1], "params", WIDE)), "error reprojection: do not belong"),
         (in_poses(lambda pose: ASIDE * pose, 3), "warning reprojection: 1 images are much worse"),
         (in_poses(lambda pose: FLIP * pose), "error axes: with OpenGL axes"),
         (in_poses(lambda pose: pose.inverse()), "error axes: with camera-to-world the"),
         (in_points(9, (1e6, 0, 0)), "warning points: 9 of 4500"),
-        (in_points(9, (1e38, 0, 0)), "warning points: 9 of 4500"),  # squares do not fit into 32 bits
+        # squares do not fit into 32 bits
+        pytest.param(in_points(9, (1e38, 0, 0)), "warning points: 9 of 4500", marks=pytest.mark.slow),
         (in_points(9, (1e300, 0, 0)), "warning points: 9 of 4500 are not finite in 32 bits"),
         (in_points(900, (0, 0, 40)), "warning unseen points: 20.0 %"),
     ],
@@ -212,6 +219,7 @@ def test_a_page_that_cannot_be_written_loses_no_verdict(life, examine, monkeypat
     assert examine(life, 1)[0]
 
 
+@pytest.mark.slow
 def test_a_scene_so_small_that_little_of_it_is_drawn(life, examine):
     """Both training and this command say by how much it should grow; then neither does."""
 

@@ -164,10 +164,11 @@ def test_functions_that_cannot_be_put_in_place_are_refused(part, message):
 
 LINES = [
     ("project", "    rotation_w = times(qw, rotation_scale)\n"),
-    pytest.param("perspective_lens", "    v0 = of_lens(camera, 15, z)\n", marks=pytest.mark.slow),
+    ("perspective_lens", "    v0 = of_lens(camera, 15, z)\n"),
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("word", "line"), LINES)
 def test_what_is_compiled_can_be_read(word, line):
     """What was assembled: names of a part stand in the kernel; what was written from a formula."""

@@ -95,6 +95,7 @@ def test_derivatives_that_are_written_down_are_those_of_the_formula(model):
         np.testing.assert_allclose(found[[2 + axis, 5 + axis]], wanted, rtol=1e-6, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_a_panorama_that_turns_is_a_picture_that_rolls(device):
     """At the seam nothing is lost and nothing is there twice."""
     scene = scenes.SCENES["panorama"]().to(device)

@@ -127,6 +127,7 @@ def patterned():
     return views, photographs, np.stack(depths)
 
 
+@pytest.mark.slow
 def test_photographs_tell_depths_that_the_model_does_not():
     views, photographs, truth = patterned()
     assert not any(view.depth.any() for view in agreed(views[1:3]))

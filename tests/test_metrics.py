@@ -232,7 +232,11 @@ def test_flip_that_is_not_installed_is_named(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("net", "name"), [pytest.param("vgg16", "LPIPS", marks=pytest.mark.long), ("alexnet", "LPIPS_ALEX")]
+    ("net", "name"),
+    [
+        pytest.param("vgg16", "LPIPS", marks=pytest.mark.long),
+        pytest.param("alexnet", "LPIPS_ALEX", marks=pytest.mark.slow),
+    ],
 )
 @pytest.mark.filterwarnings("ignore::UserWarning")
 def test_lpips_takes_weights_from_disk(tmp_path, net, name):

@@ -37,6 +37,7 @@ def test_training_goes_on_as_in_memory(options, scene, tmp_path):
     assert not differing or options.get("parts")
 
 
+@pytest.mark.slow
 def test_the_saved_model_is_that_of_memory(tmp_path):
     """With all that a command does before and after."""
     for folder, more in (("memory", ()), ("file", ("--out_of_core",))):

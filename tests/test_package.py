@@ -204,6 +204,7 @@ print(sum(torch.equal(each, found[-1]) for each in found))
 """
 
 
+@pytest.mark.slow
 def test_first_renders_of_several_threads():
     """Else their kernels are mixed up, or fail in the parser; in about half of the runs before."""
     assert python("-c", FIRST_RENDERS).stdout.split()[-1] == "7"

@@ -159,6 +159,7 @@ def test_small_differences_of_depth_decide_the_order(browser, tmp_path):
         assert np.abs(pixels(page, index).astype(int) - picture(camera)).max() <= 2
 
 
+@pytest.mark.slow
 def test_a_screenshot_shows_the_first_camera_and_a_drag_another_view(browser, tmp_path):
     folder, picture, cameras = model(tmp_path, some_splats(400))
     page = open_page(browser, export(folder))

@@ -31,7 +31,11 @@ def bounded():
     return [load_scene(embedded_scene(), resolution=8, memory=limit, report=str) for limit in limits]
 
 
-@pytest.mark.parametrize("options", [{"coarse": 4, "coarse_until_iter": 30}, {"parts": "exposure,background"}], ids=str)
+@pytest.mark.parametrize(
+    "options",
+    [pytest.param({"coarse": 4, "coarse_until_iter": 30}, marks=pytest.mark.slow), {"parts": "exposure,background"}],
+    ids=str,
+)
 def test_a_bound_changes_no_byte(options, scene, bounded, tmp_path):
     whole = stepped(scene, tmp_path, 36, **options)
     for limited in bounded:
@@ -42,7 +46,8 @@ def test_a_bound_changes_no_byte(options, scene, bounded, tmp_path):
     check_same(resumed(bounded[1], tmp_path / "resumed", (20, 36), then=scene, **options), whole)
 
 
-@pytest.mark.parametrize("fit", [pytest.param(10**9, marks=pytest.mark.slow), 20])
+@pytest.mark.slow
+@pytest.mark.parametrize("fit", [10**9, 20])
 def test_what_does_not_fit_is_decoded_once_while_the_disk_has_room(scene, bounded, tmp_path, monkeypatch, fit):
     """A header of 128 bytes is before each."""
     room = 2 * fit * (SIZE + 128)

@@ -59,6 +59,7 @@ def test_every_dependency_has_a_wheel(platform):
     assert ("pycolmap" in names) == (platform in WITH_PYCOLMAP)
 
 
+@pytest.mark.slow
 def test_nothing_needs_glibc_or_proc():
     python("-c", ELSEWHERE)
 

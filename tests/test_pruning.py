@@ -232,6 +232,7 @@ def test_simplify_to_a_size_and_to_a_loss(folder, tmp_path, ran):
     assert loss >= -0.5 and len(load_gaussians(tmp_path / "b.ply").splats.means) < len(splats.means)
 
 
+@pytest.mark.slow
 def test_only_what_a_crop_leaves_is_compared(folder, tmp_path, ran, fails):
     """Otherwise what lies around the box is missing in all pictures: figures are far lower."""
     folder, splats = folder
@@ -246,7 +247,11 @@ def test_only_what_a_crop_leaves_is_compared(folder, tmp_path, ran, fails):
     assert "cover pixels of photographs" in fails(*arguments, "--crop", *(one - 1e-3), *(one + 1e-3))
 
 
-@pytest.mark.parametrize("command", [["simplify", "--keep", "0.9"], ["clean"]], ids=lambda words: words[0])
+@pytest.mark.parametrize(
+    "command",
+    [pytest.param(["simplify", "--keep", "0.9"], marks=pytest.mark.slow), ["clean"]],
+    ids=lambda words: words[0],
+)
 def test_what_a_file_has_no_room_for_counts(folder, tmp_path, ran, monkeypatch, fails, command):
     """What is said of a .splat is what is there, which has no harmonics, nor a mark of antialiasing."""
     monkeypatch.setattr("warp_splat.pruning.simplify.LEVELS", (1.0,))

@@ -229,6 +229,7 @@ def test_a_full_disk_ends_a_stage_with_a_sentence(tmp_path, monkeypatch, free):
     assert bool(begun) == bool(free)
 
 
+@pytest.mark.slow
 def test_photographs_that_cannot_be_read_are_left_out(photos, tmp_path, capsys):
     folder = tmp_path / "photos"
     for index, name in enumerate(photos[1]):

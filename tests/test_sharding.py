@@ -233,6 +233,7 @@ def test_a_process_that_hangs_beside_this_one_is_killed(monkeypatch):
         hung.kill()
 
 
+@pytest.mark.slow
 def test_a_process_without_signs_is_named(monkeypatch):
     """Of three, the last leaves no sign, and the second one has left as it should."""
     monkeypatch.setattr(watch, "GONE", 1.5)

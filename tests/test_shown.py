@@ -321,6 +321,7 @@ def test_event_files_hold_every_loss(told):
     assert dict(found["test/FLIP"])[20] == pytest.approx(results["FLIP"])
 
 
+@pytest.mark.slow
 def test_curves_go_on_from_a_checkpoint(told, tmp_path):
     """Losses that were not yet written with it are written again, in place of what the stopped run wrote later."""
     folder = tmp_path / "model"

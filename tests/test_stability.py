@@ -104,6 +104,7 @@ def test_the_exact_determinant_is_that_of_the_matrix():
         assert formula(a1, a2)[0] == pytest.approx(expected, rel=1e-5)
 
 
+@pytest.mark.slow
 def test_ours_keeps_the_digits_of_needles_and_of_long_chains():
     """A few roundings at every angle and ratio, where the usual formula has none left; T like the number of layers."""
     ours, usual = (max(rounding.determinant_errors()[name]) for name in ("ours", "usual"))

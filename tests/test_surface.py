@@ -126,6 +126,7 @@ def test_depths_and_normals_come_to_agree(scene, tmp_path):
     assert unlike[1] < 0.95 * unlike[0]
 
 
+@pytest.mark.slow
 def test_the_same_bits_for_any_number_of_threads(scene, tmp_path, same_by_threads):
     def trained():
         return stepped(scene, tmp_path, 30, **SURFACE)[0].model.parameters.values()

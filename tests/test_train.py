@@ -110,8 +110,8 @@ def test_another_seed_is_another_result(trained, tmp_path, capsys):
     "options",
     [
         ("--optimizer_type", "sparse_adam"),
-        ("--antialiasing", "--sh_degree", "1"),
-        ("--max_gaussians", "5000"),
+        pytest.param(("--antialiasing", "--sh_degree", "1"), marks=pytest.mark.slow),
+        pytest.param(("--max_gaussians", "5000"), marks=pytest.mark.slow),
         pytest.param(("--random_background",), marks=pytest.mark.slow),
         pytest.param(("--white_background", "--sh_degree", "0"), marks=pytest.mark.slow),
         pytest.param(("--prune_screen_size", "20"), marks=pytest.mark.slow),

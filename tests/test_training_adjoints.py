@@ -37,6 +37,7 @@ def test_short_schedule_is_whole_within_its_steps():
     assert trained.COMPARED[-1] < 2 * trained.SHORT["densification_interval"] < trained.SHORT["densify_until_iter"]
 
 
+@pytest.mark.slow
 def test_run_writes_its_files(tiny, scene, tmp_path):
     said = []
     results = trained.run_trainings(tmp_path / "new", ["manual", "stepwise"], {"embedded": scene}, say=said.append)

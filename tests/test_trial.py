@@ -86,7 +86,8 @@ def test_points_that_all_photographs_show_are_said_to_be():
     assert few_photographs(scene, 25) == (True, "half of its points lie in all 3 photographs (limit 25)")
 
 
-@pytest.mark.parametrize("gain", [pytest.param(-99.0, marks=pytest.mark.slow), 99.0])
+@pytest.mark.slow
+@pytest.mark.parametrize("gain", [-99.0, 99.0])
 def test_a_training_is_the_same_as_with_the_parts_that_auto_names(gain, tmp_path, monkeypatch, capsys):
     """And goes on with them, without another trial."""
     monkeypatch.setattr(trial, "SHORTEST", 5)

@@ -209,6 +209,7 @@ def test_bad_volumes_are_refused(name, value):
     refusal(lambda: Volume(**vars(alone()) | {name: value}), "Volume")
 
 
+@pytest.mark.slow
 def test_run_writes_its_files(tmp_path, monkeypatch):
     scenes = {name: measure.SCENES[name] for name in ("one", "needle at the edge")}
     few = {"OPTICAL_DEPTHS": (1.0, 1e6), "SAMPLES": [8, 64, 512, 4096], "REPEATS": 1, "RAYS": 2}
