@@ -120,21 +120,21 @@ def crowded(count, width):
     return Bins(count, gaussians, None, nothing, places, begins, nothing, [], 1, 16, 0), rows, counts
 
 
-def test_depths_are_sorted_in_ranges(monkeypatch, threads):
+def test_depths_are_sorted_in_pieces(monkeypatch, threads):
     """Whatever their sign and size, ties by index; and the depths stay as they are."""
-    monkeypatch.setattr(bin, "IN_RANGES", 1000)
+    monkeypatch.setattr(bin, "IN_PIECES", 1000)
     random = np.random.default_rng(0)
     depths = (random.choice([-1.0, 1.0], 7003) * 10.0 ** random.uniform(-30, 30, 7003)).astype(np.float32)
     depths[random.integers(0, 7003, 3000)] = 2.5
     before = depths.copy()
-    for count in (1, 2, 5):
+    for count in (1, 2, 4, 7):
         threads(count)
         assert (bin.order_by_depth(depths) == np.argsort(depths, kind="stable")).all()
         assert (depths == before).all()
 
 
 def test_the_number_of_threads_changes_nothing(monkeypatch, same_by_threads):
-    monkeypatch.setattr(bin, "IN_RANGES", 1000)
+    monkeypatch.setattr(bin, "IN_PIECES", 1000)
     camera, projected = project(5000)
     same_by_threads(lambda: attrgetter("instances", "places", "ranges")(CPU.bin(projected, camera, PLAIN)))
 

@@ -141,9 +141,11 @@ def slice_count(work: int, shares: int = 1, smallest: int = 0) -> int:
     return max(1, min(shares * _threads if _threads > 1 else 1, work // (smallest or SMALLEST_SLICE)))
 
 
-def even_slices(dim: int, smallest: int = 0, each: int = 1, device: torch.device | str = "cpu") -> list[int]:
-    """Bounds of one slice per thread of ``dim`` equal pieces of work, of ``each`` indices; of one slice on a GPU."""
-    parts = 1 if torch.device(device).type == "cuda" else slice_count(dim * each, smallest=smallest)
+def even_slices(
+    dim: int, smallest: int = 0, each: int = 1, device: torch.device | str = "cpu", shares: int = 1
+) -> list[int]:
+    """Bounds of ``shares`` slices per thread of ``dim`` pieces of work, of ``each`` indices; of one slice on a GPU."""
+    parts = 1 if torch.device(device).type == "cuda" else slice_count(dim * each, shares, smallest)
     return [dim * part // parts for part in range(parts + 1)]
 
 
