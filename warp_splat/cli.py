@@ -147,7 +147,8 @@ def _restarted(given: dict) -> dict:
     path = os.path.join(folder, LAST)
     again = os.environ.get("TORCHELASTIC_RESTART_COUNT", "0") != "0"
     own = again and folder and os.path.isfile(path) and os.path.getmtime(path) > begun  # not of an older training
-    return {"start_checkpoint": folder} if own else given
+    of_this_run = {name: given[name] for name in ("verify", "viewer", "port") if name in given}
+    return {"start_checkpoint": folder, **of_this_run} if own else given
 
 
 def _continued(given: dict) -> dict:

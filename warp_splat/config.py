@@ -68,7 +68,8 @@ class RasterOptions:
         t_min: a pixel stops before the Gaussian that would take its transmittance below this, 0 to 1; 0 means 1e-30.
         max_steps: entries of a tile's list that are looked at, nearest first; None: all of them.
         extent: which tiles list a Gaussian: "ellipse" (exactly those where its opacity reaches ``alpha_min``) or
-            "square" (of the reference: 3 standard deviations of the long axis).
+            "square" (of the reference: 3 standard deviations of the long axis). A CPU also leaves out the blocks of
+            4 x 4 pixels outside of that square, where alpha may still be 0.011; a GPU draws them.
         exp_degree: degree of the polynomial in the exponential, 3 to 6; None calls the C library's, without lanes. On a
             GPU its own instruction, with an error of 2.4e-7, stands for 3 to 5.
         falloff: of your own instead of the Gaussian's, see :class:`warp_splat.Falloff`; not with adjoint "manual".

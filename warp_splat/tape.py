@@ -158,7 +158,7 @@ def draw_worlds(
 
     Returns:
         Image, alpha and what else is asked for, by their names, with one more dimension in front, on black; and what
-        others take for their backdrop.
+        others take for their backdrop. They share memory: do not write into pictures of a backdrop that is in use.
 
     Raises:
         InputError: as :func:`rasterize` does.

@@ -164,7 +164,7 @@ def _tell(request: Request, seen: Seen, lists: list[Bins]) -> dict[str, Any]:
     sizes = torch.cat([bins.ranges[:, 1] - bins.ranges[:, 0] for bins in lists])
     per_gaussian = torch.bincount(gaussians, minlength=len(numbers)).int()
     keys = torch.arange(scenes * cameras * tiles_x * tiles_y, device=numbers.device)
-    bits = max((tiles_x * tiles_y - 1).bit_length(), 1)
+    bits = (tiles_x * tiles_y).bit_length()  # as gsplat reads them
     keys = ((keys // (tiles_x * tiles_y)) << bits | keys % (tiles_x * tiles_y)).repeat_interleave(sizes)
     return {
         **ids,

@@ -225,7 +225,7 @@ def make_beyond(fall_at: wp.Function) -> tuple[wp.Function, wp.Function]:
     @wp.func
     def farther(d: float, most: float):
         """The largest alpha ``d`` standard deviations away or farther, rounded up."""
-        near = wp.clamp(d * 0.9999 - 1.0e-3, 0.0, 16.0)
+        near = wp.clamp(d * 0.9999 - 1.0e-3, 0.0, 1.0e4)
         return int(wp.ceil(most * fall_at(0.5 * LOG2_E * near * near)))
 
     @wp.func

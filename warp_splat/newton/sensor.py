@@ -129,10 +129,11 @@ class SensorSplatCamera:
             camera: size and lens of all views, or of each, or of each of the tiled cameras; its pose does not count.
             rgb_image: vec3, colors as trained, displayed without a change.
             color_image: uint32, the same packed as Newton packs RGBA.
-            forward_depth_image: float, expected depth along the axis; 0 where nothing is.
+            forward_depth_image: float, expected depth along the axis, of a wide lens the distance; 0 where nothing is.
             shape_index_image: uint32, the shape seen most; 0xFFFFFFFF where nothing is.
             mesh_color: uint32, ``color_image`` of Newton's sensor: what is seen through the Gaussians.
-            mesh_depth: float, its ``forward_depth_image``: hides Gaussians whose centers are farther.
+            mesh_depth: float, its ``forward_depth_image``, for a wide lens its ``depth_image``: hides Gaussians whose
+                centers are farther.
             mesh_index: uint32, its ``shape_index_image``.
             world_indices: world of each view, which the host reads; by default view i is world i.
 

@@ -1,6 +1,7 @@
 """A set of Gaussians in fewer: which to leave out, and training that makes up for it."""
 
 import math
+import os
 from dataclasses import replace
 
 import numpy as np
@@ -26,7 +27,7 @@ STAGES, THINNED = 5, 1 / 3  # of training: how often Gaussians are left out, and
 #: - 31.51 (30.99) dB: three times, left out in stages
 RATES = TRIPLED | {"position_lr_init": 1.6e-4, "position_lr_final": 1.6e-5}
 #: Options of the model's training that hold here; what was learned of cameras and background is so already.
-SAME = {"white_background", "projection", "lambda_dssim", "loss_space", "parts", "opacity_reg"}
+SAME = {"white_background", "projection", "lambda_dssim", "loss_space", "parts", "opacity_reg", "depths"}
 SAME |= {"exposure", "vignetting", "random_background"}
 LEARNED = {"pose", "sky"}  # parts of which the model has what they found
 NEVER = 2**31  # a step that does not come
@@ -97,6 +98,7 @@ def _config(file: SplatFile, steps: int, degree: int, trained: dict, device: tor
     """Options of a training that neither grows nor resets, at all degrees from its first step on."""
     known = {item.name: item for item in flags_of(TrainConfig) if item.name in SAME}
     same = {name: trained[name] for name, item in known.items() if name in trained and fits(trained[name], item)}
+    same["depths"] = depths if os.path.isdir(depths := str(same.get("depths", ""))) else ""
     same["parts"] = ",".join(name for name in same.get("parts", "").split(",") if name in {*PARTS} - LEARNED)
     return TrainConfig(
         **RATES,

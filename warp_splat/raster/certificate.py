@@ -53,7 +53,8 @@ def looking(options: RasterOptions) -> RasterOptions:
     """Options for the lists: the blend looks farther than to its cut, and so knows what it skips."""
     if not options.bound:
         return options
-    return replace(options, alpha_min=0.9 * ALPHA_MIN if options.of == "trained" else SEEN * options.alpha_min)
+    least = min(0.9 * ALPHA_MIN, options.alpha_min) if options.of == "trained" else SEEN * options.alpha_min
+    return replace(options, alpha_min=least)
 
 
 def drawing(options: RasterOptions) -> RasterOptions:

@@ -79,7 +79,8 @@ class Worlds:
             options = replace(options, hidden_from=options.hidden_from.flatten(0, 1))
         self.counts, self.options, self.backdrop = counts, options, backdrop
         self.driver = driver_of(gaussians[0].device)
-        self.camera = replace(camera, height=camera.height * len(counts))  # of pictures below each other
+        # of pictures below each other: from here on, its size alone counts
+        self.camera = replace(camera, height=camera.height * len(counts), lens=None, shutter=None)
         with checks.explained(options, gaussians[0], [self.camera]):
             if sum(counts) != len((checked := checks.check_gaussians(*gaussians)).means):
                 raise InputError(f"counts: expected {len(checked.means)} Gaussians in all, got {sum(counts)}.")
@@ -96,6 +97,7 @@ class Worlds:
         with checks.explained(self.options, self.splats.means2d, [self.camera]):
             return self._draw()
 
+    @torch.no_grad()
     def _draw(self) -> dict[str, torch.Tensor]:
         blending, black = Blending(self.bins, self.camera, self.options, self.driver), self.splats.depths.new_zeros(3)
         (image, alpha, depth), blending.saved = self.driver.blend(self.bins, self.camera, black, self.options, False)

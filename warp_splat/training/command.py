@@ -83,6 +83,8 @@ def _train_blocks(config: TrainConfig) -> int:
             "trained again; move that folder away, and the same command trains all of it anew."
         )
     settled = {"settle_from_iter": 1, "cooldown": config.learn.iterations - 1, "coarse": 1}  # nothing grows, rates fall
+    if limit := config.grow.max_gaussians:
+        settled["max_gaussians"] = max(limit, len(merged))  # it was each block's
     return _go_on(config, folder / "together", start_ply=str(folder), **settled)
 
 

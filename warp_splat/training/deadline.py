@@ -90,7 +90,8 @@ def plan_training(scene: Scene, config: TrainConfig, processes: Processes, say: 
             "coarse_until_iter, or cooldown."
         )
     cost = cost_of(trial, task, say)
-    plan = plan_for(config, cost, 60.0 * minutes, task)
+    plan, images = plan_for(config, cost, 60.0 * minutes, task), processes.images
+    plan = plan.changed(iterations=-(-plan.learn.iterations // images) * images)  # whole steps, as when it is repeated
     say(f"Plan for {minutes:g} minutes ({seconds_of(plan, cost, task):.0f} s by these figures): {as_flags(plan)}")
     if trial.growth.grows(config.learn.iterations):
         steps = plan.learn.iterations

@@ -57,8 +57,13 @@ def resolve(config: TrainConfig, processes: Processes) -> tuple[TrainConfig, Che
             f"WARP_SPLAT_PORTABLE: expected it {expected}, as in {begun.path} ({FIXED_OPTIONS['portable']}), but it is "
             f"{here}; change it, or start anew."
         )
+    for name in ("optimizer_type", "growth") if begun else ():
+        if (here := config.flat()[name]) != (kept := load_options(begun.path)[name]):
+            raise InputError(
+                f"--{name} {here}: expected {kept}, as in {begun.path} ({FIXED_OPTIONS[name]}); leave it out."
+            )
     done = begun.count("iteration") if begun else 0
-    if begun and done > end:  # at the end, what is written there is written again
+    if begun and done >= end + processes.images:  # at the end, what is written there is written again
         raise InputError(f"--iterations {end}: expected at least {done}, as in {begun.path}; name a later end.")
     folder = Path(config.report.model_path or (begun.path.parent if begun else model_folder.default_model_path()))
     check_folder(config, folder)
@@ -129,6 +134,8 @@ def open_scene(config: TrainConfig, begun: Checkpoint | None, say: Report, proce
     memory = photo_memory(config.machine.photo_memory, processes)
     scene = load_scene(data.source_path, **same, start=start, memory=memory, report=say)
     if begun:
+        if data.start_ply and not start:  # whose points tell how near they come to cameras
+            scene.__dict__["extent"] = begun.fact("extent", float)
         folder = begun.path.parent
         scene.refuse_other_frame(folder, read_coordinates(folder))
         if (args := folder / "cfg_args").is_file() and f"linear_light={not scene.linear}".encode() in args.read_bytes():

@@ -105,6 +105,9 @@ class Photographs:
     def expect(self, views: Iterable[tuple[View, int]]) -> None:
         """Say which come next, and in which iterations, so that threads decode them ahead."""
         self._expected = deque(views)
+        wanted = {(view, shrink_at(self.config.learn, self.shares, iteration)) for view, iteration in self._expected}
+        for other in self._coming.keys() - wanted:
+            self._coming.pop(other).cancel()
         self._read_ahead()
 
     def _read_ahead(self) -> None:
@@ -127,6 +130,8 @@ class Photographs:
         if found is None:
             with stage("photographs"):
                 coming = self._coming.pop((view, self._shrink), None)
+                with suppress(ValueError):
+                    self._expected.remove((view, iteration))  # it has come, and must not be read again
                 self._read_ahead()
                 found = coming.result() if coming else self._made(view, self._shrink)
             if self._size + found.nbytes <= self._limit:
