@@ -18,6 +18,7 @@ from warp_splat.formats.model_folder import ply_path
 from warp_splat.formats.ply import save_points
 from warp_splat.scene import load_scene
 from warp_splat.scene.blocks import BLOCK, block_of
+from warp_splat.training.options import TrainConfig
 
 APART = 100.0
 
@@ -82,6 +83,32 @@ def trained(tmp_path_factory):
     folder = tmp_path_factory.mktemp("blocks") / "one"
     assert train(folder, "--block", "1/2") == 0
     return folder
+
+
+def test_a_block_whose_model_is_elsewhere_has_not_ended(tmp_path, capsys):
+    """As where the disk is full: the next run saves it again."""
+    (tmp_path / "point_cloud").mkdir()
+    (tmp_path / "point_cloud/iteration_5").write_text("in the way")
+    assert train(tmp_path, "--block", "1/2", "--iterations", "5", "--no-eval") == 1
+    assert "is not in" in capsys.readouterr().err and not (tmp_path / BLOCK).exists()
+
+
+@pytest.mark.slow
+def test_a_budget_is_a_blocks_own(tmp_path, ran):
+    """Together they are more."""
+    words = "train", "-s", SCENE, "-m", tmp_path, "-r", "8", "--iterations", "20", "--blocks", "4"
+    ran(*words, "--growth", "mcmc", "--max_gaussians", "2600")
+    assert len(load_gaussians(ply_path(tmp_path / "together", 20)).splats.means) > 2600
+
+
+@pytest.mark.parametrize(("name", "other"), [("optimizer_type", "sparse_adam"), ("growth", "mcmc")])
+def test_a_block_half_trained_keeps_its_kind(tmp_path, monkeypatch, fails, name, other):
+    words = "train", "-s", SCENE, "-m", tmp_path, "-r", "8", "--iterations", "9", "--blocks", "2", "--quiet"
+    with monkeypatch.context() as patch:
+        interrupt(patch, 1)
+        assert main([*map(str, words)]) == 130
+    more = ("--max_gaussians", 9000) * (name == "growth")
+    assert f"--{name} {other}: expected {TrainConfig().flat()[name]}, as in" in fails(*words, f"--{name}", other, *more)
 
 
 def put(trained, folder, *numbers):

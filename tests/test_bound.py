@@ -48,6 +48,18 @@ def ratios(gaussians, camera, background, options):
     return (out.bound / error.clamp_min(1e-12))[known]
 
 
+@pytest.mark.parametrize("extent", ["ellipse", "square"])
+@pytest.mark.parametrize("of", ["ideal", "trained"])
+def test_a_bound_changes_no_picture(of, extent):
+    options = RasterOptions(alpha_min=1e-3, of=of, extent=extent)
+    camera = look(90, 70)
+    gaussians = made_up(0, 200, (1.0, 8.0), (0.01, 1.0), 0.2, 1.0, camera)
+    plain, bounded = (
+        render(gaussians, camera, torch.zeros(3), replace(options, bound=bound)).image for bound in (False, True)
+    )
+    assert (plain - bounded).abs().max() < 1e-6
+
+
 @pytest.mark.parametrize("case", RENDERED, ids=[case.name for case in RENDERED])
 def test_stiff_and_extreme_cases(case):
     problem = case.build()

@@ -212,6 +212,7 @@ def test_a_process_that_torchrun_starts_again_goes_on_from_its_own_checkpoint(tm
     monkeypatch.setenv("TORCHELASTIC_MAX_RESTARTS", "1")
     monkeypatch.chdir(tmp_path)
     assert goes_on() and parse(words).learn.iterations == 50
+    assert parse([*words, "--verify", "01234567"]).report.verify == "01234567"
     with pytest.raises(InputError, match="-m: expected a folder, from which torchrun's --max-restarts could go on"):
         parse(["train", "-s", str(SCENE)])
     os.utime(tmp_path / LAST, (0, 0))  # of an older training, which the next step of the program refuses to overwrite

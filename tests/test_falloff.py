@@ -1,5 +1,6 @@
 """A falloff of the user's own, on both drivers, against the formulas in torch, pixel by pixel and in float64."""
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -9,10 +10,11 @@ from commands import ROOT
 from common import using
 from heavy_tails import fall, heavy_tails, reach
 from hostile import refusal
-from scenes import SCENES
+from scenes import SCENES, make_camera
 
 from warp_splat import Falloff, RasterOptions, check_gradients, rasterize
 from warp_splat.config import ALPHA_MAX
+from warp_splat.kernels.simd import fill, over, times
 from warp_splat.raster.drivers import CPU, CUDA
 from warp_splat.raster.gradcheck import _check_falloff
 
@@ -124,6 +126,33 @@ def too_near(x: float):
 def test_what_is_none_is_found(falloff, message):
     check = lambda: _check_falloff(falloff, torch.device("cpu"))  # noqa: E731
     refusal(check, match=message) if message else check()
+
+
+@wp.func
+def cubic(q: Any):
+    one = fill(1.0, q)
+    inverse = over(one, one + q / 3.0)
+    return times(inverse, times(inverse, inverse))
+
+
+@wp.func
+def cubic_reach(x: float):
+    return 3.0 * (wp.pow(x, 1.0 / 3.0) - 1.0)
+
+
+@pytest.mark.parametrize("cuts", [{"tolerance": 1e-3}, {"alpha_min": 2e-6}], ids=str)
+def test_the_bound_of_one_that_falls_slowly(cuts):
+    """Against all that can be drawn; far away, hundreds count."""
+    random = torch.Generator().manual_seed(0)
+    camera, falloff = make_camera(400, 40, fx=100.0, seed=None), Falloff(cubic, cubic_reach)
+    means = 0.1 * torch.randn(300, 3, generator=random) + torch.tensor([-1.5, 0.0, 4.0])
+    quats, sh = torch.randn(300, 4, generator=random), 1.7 * torch.rand(300, 1, 3, generator=random)
+    given = means, quats, torch.full((300, 3), 0.03), torch.full((300,), 0.985), sh, camera
+    options = RasterOptions(falloff=falloff, t_min=0.0, alpha_min=1e-12)
+    exact = rasterize(*given, adjoint="stepwise", options=options).image
+    out = rasterize(*given, adjoint="stepwise", options=replace(options, bound=True, **{"alpha_min": 1 / 255, **cuts}))
+    error = (out.image - exact).abs().amax(2)
+    assert error.max() > 1e-4 and (error <= out.bound + 1e-5).all()
 
 
 def test_it_is_the_one_of_the_page():

@@ -223,6 +223,9 @@ def test_modes_channels_and_batches(mode, channels):
     assert torch.equal(packed["means2d"], meta["means2d"][1, 1][seen])
     order = packed["gaussian_ids"][packed["flatten_ids"].long()]
     assert torch.equal(order, meta["flatten_ids"][meta["isect_offsets"][1, 1, 0, 0] :].long() - 3 * len(colors))
+    bits = (meta["tile_width"] * meta["tile_height"]).bit_length()  # as gsplat counts them
+    views, tiles = (meta["isect_ids"] >> 32 + bits).unique(), (meta["isect_ids"] >> 32) % 2**bits
+    assert views.tolist() == [0, 1, 2, 3] and tiles.max() < meta["tile_width"] * meta["tile_height"]
     assert (packed["isect_ids"].diff() >= 0).all() and packed["tiles_per_gauss"].sum() == len(order)
 
 

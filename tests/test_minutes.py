@@ -15,7 +15,7 @@ from warp_splat.errors import InputError
 from warp_splat.flags import flags_of
 from warp_splat.formats.checkpoint import load_checkpoint
 from warp_splat.formats.model_folder import ply_path
-from warp_splat.runtime.distributed import ALONE
+from warp_splat.runtime.distributed import ALONE, Processes
 from warp_splat.training import plan as plans
 from warp_splat.training.deadline import REACHED, Deadline, plan_training
 from warp_splat.training.options import LearnOptions, TrainConfig, schedule_of
@@ -251,6 +251,15 @@ def test_a_whole_training_by_the_clock_is_repeated_by_its_options(tmp_path, ran)
     first, again = (json.loads((tmp_path / name / "history.json").read_text()) for name in "ab")
     assert [{**record, "seconds": 0} for record in first] == [{**record, "seconds": 0} for record in again]
     assert len(first) <= max(options["iterations"] // 50, 1)  # evaluations take no large part of so short a time
+
+
+@pytest.mark.parametrize("images", [1, 4])
+def test_a_plan_has_whole_steps(scene, monkeypatch, images):
+    """Else the same options, which round up to them, would train otherwise."""
+    monkeypatch.setattr("warp_splat.training.deadline.cost_of", lambda *_: COST)
+    config = FAST.changed(minutes=1.0, views=images)
+    plan = plan_training(scene, config, Processes(images=images), str)
+    assert plan.learn.iterations % images == 0
 
 
 @pytest.mark.slow

@@ -1,5 +1,6 @@
 """Photographs within a bound of memory: the same bytes of the model as with all of them in memory."""
 
+import threading
 from collections import Counter
 from types import SimpleNamespace
 
@@ -82,6 +83,20 @@ def test_a_photograph_whose_end_finds_no_room_is_not_kept(tmp_path):
 def check_kept(trainer):
     kept = sum(plane.nbytes for p in trainer.photographs.kept.values() for plane in p if plane is not None)
     assert kept <= trainer.scene.memory.limit and len(trainer.photographs._coming) <= decoding.AHEAD
+
+
+def test_all_but_the_first_are_decoded_ahead(scene, bounded, tmp_path, monkeypatch):
+    """By threads, which never stop to, in each size; nothing that has come is read again."""
+    pixels, places = View.pixels.fget, Counter()
+
+    def counted(view):
+        places[threading.current_thread() is threading.main_thread()] += 1
+        return pixels(view)
+
+    monkeypatch.setattr(View, "pixels", property(counted))
+    trainer, run = begin(bounded[0], tmp_path, coarse=2, coarse_until_iter=30)
+    steps(trainer, run, 60)
+    assert places[True] <= 2 and places[False] <= 60 + 2 * decoding.AHEAD
 
 
 def test_what_comes_is_what_is_dealt(scene):

@@ -1,5 +1,6 @@
 """Many worlds in one pass, and what they share drawn once: the bits of a call for each, on the CPU and in fibers."""
 
+from dataclasses import replace
 from functools import partial
 
 import pytest
@@ -7,7 +8,7 @@ import torch
 from hostile import refusal
 from scenes import cloud, make_camera
 
-from warp_splat import CameraParameters, RasterOptions, rasterize
+from warp_splat import CameraParameters, Lens, RasterOptions, rasterize
 from warp_splat.raster.worlds import Worlds, takes
 
 COUNTS = (30, 0, 25)  # one has none of its own
@@ -48,6 +49,19 @@ def test_the_bits_are_those_of_a_call_for_each(asked, driver):
     check(among.pictures, [together([SHARED, own]) for own in OWN], lambda _world: options)
     assert among.touched.any() and not among.touched.all() and among.pictures["alpha"][1].max() > 0.1
     assert set(among.pictures) >= {"image", "alpha", *{"depth", "strongest"}.intersection(asked)}
+
+
+@pytest.mark.parametrize(
+    "lens", [Lens("SIMPLE_RADIAL", (-0.1,)), Lens("OPENCV_FISHEYE", (0.1, 0.0, 0.0, 0.0))], ids=str
+)
+def test_a_lens_is_that_of_each_picture(lens):
+    """Not of all below each other, which would be too tall for it; and there are no gradients."""
+    camera, options = replace(CAMERA, lens=lens), RasterOptions(strongest=1)
+    leaves = [tensor.requires_grad_() for tensor in together([OWN[0]] * 8)]
+    worlds = Worlds(leaves, [COUNTS[0]] * 8, camera, options)
+    alone = rasterize(*OWN[0], camera, options=options)
+    assert all(torch.equal(picture, alone.image) for picture in worlds.pictures["image"])
+    assert not any(table.requires_grad for table in worlds.pictures.values())
 
 
 def test_what_hides_is_each_worlds_own(driver):
