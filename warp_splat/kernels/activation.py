@@ -12,8 +12,6 @@ from warp_splat.kernels.compiler import FORWARD_ONLY, once
 from warp_splat.kernels.falloff import LOG2_E
 from warp_splat.kernels.simd import TYPES, equal, fill, halved, less, over, pick, times, whole
 
-wp.set_module_options(FORWARD_ONLY)
-
 LARGEST = wp.constant(88.0)  # logarithm of a scale; float32 ends soon after
 LEAST = wp.constant(-87.0)
 LARGEST_SCALE = wp.constant(1.6e38)  # hardly less than exp(LARGEST)

@@ -15,8 +15,6 @@ from warp_splat.kernels.compiler import FORWARD_ONLY, once
 from warp_splat.kernels.halves import HALF, noise, rounded, widened
 from warp_splat.kernels.simd import TYPES, fill, over, pick, root, times
 
-wp.set_module_options(FORWARD_ONLY)
-
 #: Columns of the numbers of a table: rate over bias, eps, root of 1 / bias of v, and each beta with 1 - beta.
 RATE, EPS, PER_ROOT, BETA1, REST1, BETA2, REST2 = (wp.constant(column) for column in range(7))
 

@@ -5,10 +5,7 @@ from typing import Any
 
 import warp as wp
 
-from warp_splat.kernels.compiler import FORWARD_ONLY
 from warp_splat.kernels.simd import fill, fma, less, over, pick, times, vec16
-
-wp.set_module_options(FORWARD_ONLY)
 
 PI, EIGHTH, LEAST = wp.constant(math.pi), wp.constant(math.tan(math.pi / 8)), wp.constant(1.0e-37)
 #: Of arctan(t) / t - 1 by t^2, up to an eighth of a half turn: the least largest error, 2e-8.

@@ -20,8 +20,6 @@ from warp_splat.kernels.simd import fill, fma, smaller, times, where_less
 from warp_splat.kernels.structs import BinsView, Splats2DView
 from warp_splat.kernels.tiles import cut, outline, square_of
 
-wp.set_module_options(FORWARD_ONLY)
-
 EPS = wp.constant(2.0**-24)  # of float32, half a unit in the last place of 1
 BLOCK = wp.constant(4.0)  # px
 FAINT = 1.0e-13  # alpha at which the last box ends

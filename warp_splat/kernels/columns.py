@@ -2,10 +2,7 @@
 
 import warp as wp
 
-from warp_splat.kernels.compiler import FORWARD_ONLY
 from warp_splat.kernels.simd import LANES, vec16, vec32, vec48, vec64
-
-wp.set_module_options(FORWARD_ONLY)
 
 
 @wp.func

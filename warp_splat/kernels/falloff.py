@@ -21,8 +21,6 @@ from warp_splat.kernels.compiler import FORWARD_ONLY, once
 from warp_splat.kernels.inline import without_gradient
 from warp_splat.kernels.simd import LANES, fill, fma, fraction, halved, times, vec16, whole
 
-wp.set_module_options(FORWARD_ONLY)
-
 #: Coefficients of 2^-f on [0, 1), by degree: the least largest relative error, 7e-5, 3e-6, 5e-8 and below rounding.
 EXP2 = {
     3: (0.9999251962, -0.6910207272, 0.2300703675, -0.0390122607),

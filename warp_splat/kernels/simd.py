@@ -20,10 +20,8 @@ from typing import NamedTuple
 
 import warp as wp
 
-from warp_splat.kernels.compiler import FORWARD_ONLY, PORTABLE
+from warp_splat.kernels.compiler import PORTABLE
 from warp_splat.kernels.inline import defined
-
-wp.set_module_options(FORWARD_ONLY)
 
 LANES = 16
 vec16 = wp.types.vector(length=LANES, dtype=float)

@@ -25,12 +25,9 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from warp_splat.kernels.compiler import FORWARD_ONLY
 from warp_splat.kernels.falloff import Falloff
 from warp_splat.kernels.simd import fill, fma, negative, over, smaller, times, vec16, where_less
 from warp_splat.kernels.slots import CHANNEL
-
-wp.set_module_options(FORWARD_ONLY)
 
 
 class BlendVariant(NamedTuple):

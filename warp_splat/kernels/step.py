@@ -9,14 +9,11 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from warp_splat.kernels.compiler import FORWARD_ONLY, once
+from warp_splat.kernels.compiler import once
 from warp_splat.kernels.falloff import LN_2, LOG2_E, Falloff, make_falloff
 from warp_splat.kernels.simd import LANES, fill, fma, func_of, inner, times, vec16, where_less
 from warp_splat.kernels.slots import CHANNEL, MEAN_X, MEAN_Y, OPACITY, XX, XY, YY
 from warp_splat.kernels.splat import adj_alpha_blend, adj_alpha_of, alpha_of, exponent, odds_of
-
-wp.set_module_options(FORWARD_ONLY)
-
 
 for number in (float, vec16):
 

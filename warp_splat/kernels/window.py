@@ -8,10 +8,7 @@ import math
 
 import warp as wp
 
-from warp_splat.kernels.compiler import FORWARD_ONLY
 from warp_splat.kernels.simd import LANES, fma, vec16
-
-wp.set_module_options(FORWARD_ONLY)
 
 WINDOW = 11
 RADIUS = WINDOW // 2

@@ -9,12 +9,10 @@ import warp as wp
 from warp_splat.config import TILE
 from warp_splat.kernels import bound as bounds
 from warp_splat.kernels.bound import BoundView, Since
-from warp_splat.kernels.compiler import FORWARD_ONLY, once
+from warp_splat.kernels.compiler import once
 from warp_splat.kernels.simd import LANES, fma, times, vec16, where_less
 from warp_splat.kernels.splat import Splat2D
 from warp_splat.kernels.structs import BinsView
-
-wp.set_module_options(FORWARD_ONLY)
 
 BLOCKS = TILE * TILE // LANES
 SETTLED = 12 * BLOCKS + 1  # rows

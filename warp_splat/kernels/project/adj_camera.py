@@ -25,8 +25,6 @@ from warp_splat.kernels.compiler import FORWARD_ONLY, once
 from warp_splat.kernels.project.camera_view import CameraView
 from warp_splat.kernels.simd import TYPES, equal, fill, fma, inner, less, pick, root, times
 
-wp.set_module_options(FORWARD_ONLY)
-
 
 @wp.func
 def total_where(mask: Any, x: Any):
