@@ -18,7 +18,7 @@ from warp_splat.kernels.harmonics import C0
 from warp_splat.raster.data import Gaussians
 from warp_splat.raster.drivers import driver_of
 from warp_splat.runtime.distributed import ALONE, Processes
-from warp_splat.runtime.launch import arrays_of, launch_in_lanes
+from warp_splat.runtime.launch import launch_in_lanes
 
 INITIAL_OPACITY = 0.1
 CHUNK = 2**16  # Gaussians that are taken at once, where all together would take much memory
@@ -32,13 +32,8 @@ def activate(logarithms: torch.Tensor, logits: torch.Tensor) -> tuple[torch.Tens
 
 def _launched(make, *inputs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Two tensors of the shapes of the last two inputs."""
-
-    def number_by_number(tensor: torch.Tensor):
-        return lambda types, rows: arrays_of([types.number], [tensor[rows]])[0]
-
     outputs, logits = [tensor.new_empty(tensor.shape) for tensor in inputs[-2:]], inputs[-1]
-    given, made = ([number_by_number(tensor) for tensor in tensors] for tensors in (inputs, outputs))
-    launch_in_lanes(make, driver_of(logits.device).lanes, len(logits), given, made, logits.device)
+    launch_in_lanes(make, driver_of(logits.device).lanes, len(logits), inputs, outputs, logits.device)
     return outputs[0], outputs[1]
 
 

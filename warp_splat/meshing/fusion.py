@@ -17,7 +17,7 @@ from warp_splat.camera import Camera
 from warp_splat.kernels.distance_field import agree, fuse
 from warp_splat.raster.api import RenderOutput
 from warp_splat.raster.beside import rays, rotations
-from warp_splat.runtime import launch
+from warp_splat.runtime.launch import launch
 
 EDGE = 8  # voxels of a block
 COARSEST = 3.0  # voxels that a pixel of a depth may span
@@ -94,10 +94,9 @@ def agreed(views: Sequence[Drawn], share: float = AGREEING) -> list[Drawn]:
         nearest = nearest_to(i, views)[:OTHERS]
         agreeing = torch.zeros(view.depth.numel(), dtype=torch.int32)
         for other in nearest:
-            depths = [launch.view(seen.depth, wp.float32) for seen in (view, other)]
             pose = relative(view.camera, other.camera)
-            inputs = [TOLERANCE, *pose, lens_of(view.camera), lens_of(other.camera), *depths]
-            launch.launch(agree, len(agreeing), inputs, [launch.view(agreeing, wp.int32)])
+            inputs = [TOLERANCE, *pose, lens_of(view.camera), lens_of(other.camera), view.depth, other.depth]
+            launch(agree, len(agreeing), inputs, [agreeing])
         enough = agreeing.view_as(view.depth) >= max(share * len(nearest), 1)
         found.append(view._replace(depth=torch.where(enough, view.depth, 0.0)))
     return found
@@ -141,13 +140,11 @@ def code(places: torch.Tensor) -> torch.Tensor:
 def fused(views: Sequence[Drawn], voxels: torch.Tensor, voxel: float) -> list[torch.Tensor]:
     """The distance at each voxel over the truncation, NaN where no view sees it, [V]; its color [V, 3]; views [V]."""
     sums, colors = torch.zeros(len(voxels), 2), torch.zeros(len(voxels), 4)
-    places = launch.view(voxels, wp.vec3i)
     for view in views:
         camera = view.camera
         pose = wp.mat33(*camera.rotation.ravel()), wp.vec3(*camera.translation)
-        pictures = launch.view(view.depth, wp.float32), launch.view(view.image, wp.vec3)
-        made = [launch.view(sums, wp.vec2), launch.view(colors, wp.vec4)]
-        launch.launch(fuse, len(voxels), [voxel, TRUNCATION * voxel, *pose, lens_of(camera), places, *pictures], made)
+        inputs = [voxel, TRUNCATION * voxel, *pose, lens_of(camera), voxels, view.depth, view.image]
+        launch(fuse, len(voxels), inputs, [sums, colors])
     distance = torch.where(sums[:, 1] > 0, sums[:, 0] / sums[:, 1], torch.nan)
     return [distance, colors[:, :3] / colors[:, 3:].clamp_min(1.0), sums[:, 1]]
 

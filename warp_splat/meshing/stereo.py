@@ -13,7 +13,7 @@ from warp_splat.camera import Camera
 from warp_splat.kernels.patches import REACH, SPACING, Other, search
 from warp_splat.meshing.fusion import Drawn, agreed, image_at, lens_of, nearest_to, relative
 from warp_splat.raster.beside import rays
-from warp_splat.runtime import launch
+from warp_splat.runtime.launch import launch
 from warp_splat.scene.types import View
 
 MOST, FEWEST = 1 << 16, 8  # pixels of a photograph that is looked at, larger ones are made smaller; of an edge
@@ -68,7 +68,7 @@ def _nearness(planes: torch.Tensor, camera: Camera) -> torch.Tensor:
 
 def _planes(view: Drawn, known: torch.Tensor, seen: Sequence[Drawn], nearness: wp.vec2) -> torch.Tensor:
     """Of a small view's pixels, [H, W, 3], at the median of the depths around them; 0 where none is found."""
-    others, gray = [], launch.view(view.image[..., 0], wp.float32)
+    others = []
     for picture in seen:
         other = Other()
         other.picture, other.lens = wp.from_torch(picture.image[..., 0]), lens_of(picture.camera)
@@ -79,10 +79,9 @@ def _planes(view: Drawn, known: torch.Tensor, seen: Sequence[Drawn], nearness: w
     scores = torch.where((known > 0) | nothing, 2.0, -1.0)
     guess = torch.where(known > 0, known, torch.where(nothing, 0.0, view.depth))
     planes = torch.where(guess > 0, 1 / guess, 0.0)[..., None] * torch.tensor([0.0, 0.0, 1.0])
-    inputs = [nearness, lens_of(view.camera), gray, wp.array(others, dtype=Other, device="cpu")]
+    inputs = [nearness, lens_of(view.camera), view.image[..., 0], wp.array(others, dtype=Other, device="cpu")]
     for turn in range(TURNS):
-        outputs = [launch.view(planes, wp.vec3), launch.view(scores, wp.float32)]
-        launch.launch(search, scores.numel(), [turn, *inputs], outputs)
+        launch(search, scores.numel(), [turn, *inputs], [planes, scores])
     found = torch.where(scores > LEAST, _nearness(planes, view.camera), 0.0)
     around = torch.nn.functional.unfold(found[None, None], AROUND, padding=AROUND // 2)[0]
     factor = torch.where(around > 0, around, torch.nan).nanmedian(0).values.view_as(found) / found

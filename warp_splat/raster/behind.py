@@ -87,5 +87,5 @@ class _PutBehind(torch.autograd.Function):
             adj, adj_alpha, lanes = adj.contiguous(), torch.empty_like(alpha), driver_of(alpha.device).lanes
             inputs = [ctx.rotation, rays, alpha.view(-1), behind.view(-1, 3), adj.view(-1, 3)]
             given = (make_adj_put_behind, lanes, alpha.numel(), inputs, [adj_alpha.view(-1)], alpha.device)
-            sums = launch_in_lanes(*given, run=RUN, sums=(48, vec48))
+            sums = launch_in_lanes(*given, run=RUN, sums=48)
             return adj, adj_alpha, in_pairs(sums).to(adj).view(-1, 3).nan_to_num(0.0, 0.0, 0.0), None, None

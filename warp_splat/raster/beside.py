@@ -18,7 +18,7 @@ from warp_splat.raster.camera_parameters import CameraParameters
 from warp_splat.raster.data import LESS, Bins, Gaussians, Splats2D, variant_of
 from warp_splat.raster.drivers import Driver
 from warp_splat.raster.seam import Crossing, with_copies
-from warp_splat.runtime.launch import check_memory, view
+from warp_splat.runtime.launch import check_memory
 from warp_splat.runtime.timers import stage
 
 WIDTHS = (4, 16, 32)  # columns of a slot that channels take: as many kernels sum them up
@@ -100,14 +100,12 @@ def find_strongest(splats: Splats2D, blending: Blending) -> tuple[torch.Tensor, 
 
 def _launch(blending: Blending, pixels: torch.Tensor, group: Group, strongest: tuple[torch.Tensor, ...] = ()) -> None:
     """Fill ``pixels`` [H, W, C] with a group of channels; or, with ``strongest``, ranks and median, with weights."""
-    none, (_, count) = torch.empty(0, 0, 0, dtype=torch.int32, device=pixels.device), blending.view_walk()
+    none = torch.empty(0, 0, 0, dtype=torch.int32, device=pixels.device)
     ranks, median = strongest or (none, none.flatten(1))
     at_most = ranks.shape[2] if strongest else None
     kernel = blending.driver.kernels.channels.make_beside(variant_of(blending.options), at_most)
-    inputs = [*blending.view_lists(), count, view(blending.steps, wp.int32)]
-    inputs += [view(group.rows, wp.float32), group.begin, group.count]
-    outputs = [view(pixels, wp.float32), view(ranks, wp.int32), view(median, wp.int32)]
-    blending.driver.launch_tiles(kernel, blending.bins, inputs, outputs)
+    inputs = [*blending.view_lists(), blending.saved.count, blending.steps, group.rows, group.begin, group.count]
+    blending.driver.launch_tiles(kernel, blending.bins, inputs, [pixels, ranks, median])
 
 
 def _gaussians_of(bins: Bins, camera: Camera, ranks: torch.Tensor) -> torch.Tensor:
@@ -233,9 +231,8 @@ def _differentiate(
     slots = adj_pixels.new_empty(count, columns)  # a row per tile instance
     kernel = driver.kernels.channels.make_adj_channels(mode, variant_of(options), most)
     ranks = slots.new_empty(0, 0, 0) if ranks is None else ranks.float()
-    inputs = [*blending.view_lists(), *blending.view_walk(), view(blending.steps, wp.int32)]
-    inputs += [view(group.rows, wp.float32), view(ranks, wp.float32), group.begin, group.count]
-    driver.launch_tiles(kernel, bins, [*inputs, view(adj_pixels, wp.float32)], [view(slots, wp.float32)])
+    inputs = [*blending.view_lists(), *blending.saved[:2], blending.steps]
+    driver.launch_tiles(kernel, bins, [*inputs, group.rows, ranks, group.begin, group.count, adj_pixels], [slots])
     tables = [slots.new_empty(bins.gaussian_count, size) for size in (2, 3, 1, width) if size]
     return driver.gather(bins, slots, tables)[:3], tables[-1][:, : group.count]
 

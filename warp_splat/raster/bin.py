@@ -15,7 +15,7 @@ from warp_splat.kernels.cuda.lists import make_count_tiles, make_gather_tiles, m
 from warp_splat.kernels.simd import LANES
 from warp_splat.kernels.splat import Splat2D
 from warp_splat.raster.data import LESS, MAX_INSTANCES, Bins, Room, Splats2D, falloff_of
-from warp_splat.runtime.launch import bind, check_memory, empty, launch, read_later, send, view
+from warp_splat.runtime.launch import bind, check_memory, empty, launch, read_later, send
 from warp_splat.runtime.pool import at_once, even_slices, falling_shares, in_slices, slice_count, torch_slices
 
 MANY = 10**7  # instances from which on their memory is asked for
@@ -45,7 +45,7 @@ def bin_by_counting(
     splats, rows = empty(count, Splat2D, "cpu"), np.empty(count, dtype=np.int32)
     gaussians, square = wp.array(drawn, copy=False, device="cpu"), int(options.extent == "square")
     inputs, groups = [gaussians, splats2d.view(), camera.height, options.alpha_min, square], -(-count // LANES)
-    pack = bind(lists.make_pack(falloff_of(options).reach_of), inputs, [splats, in_place(rows)], "cpu")
+    pack = bind(lists.make_pack(falloff_of(options).reach_of), inputs, [splats, rows], "cpu")
     depths, orders = splats2d.depths.detach().numpy(), list[np.ndarray]()
 
     def pack_or_sort(low: int, high: int) -> None:
@@ -58,8 +58,8 @@ def bin_by_counting(
     check_count(row_count, camera, count, splats2d.radii.device)
     begins = _put(begins, order)
     spans, counts = empty(row_count, wp.vec2i, "cpu"), np.empty(count, dtype=np.int64)
-    inputs = [splats, in_place(rows), in_place(begins), camera.width, camera.height, tiles_x, square]
-    launch(lists.find_spans, groups, inputs, [spans, in_place(counts)], bounds=even_slices(groups, each=LANES))
+    inputs = [splats, rows, begins, camera.width, camera.height, tiles_x, square]
+    launch(lists.find_spans, groups, inputs, [spans, counts], bounds=even_slices(groups, each=LANES))
     pictures = max(len(worlds), 1)
     if worlds:
         first = _first_tiles(worlds, tiles_x * tiles_y, splats2d.radii.device)[drawn[order]]
@@ -71,8 +71,7 @@ def bin_by_counting(
     check_count(total, camera, count, splats2d.radii.device)
     _check_longest(int(np.diff(ends, prepend=0).max(initial=0)))
     instances, places = (torch.empty(total, dtype=torch.int32, device="cpu") for _ in range(2))
-    inputs = [*(in_place(table) for table in (order, begins, row_ends)), spans]
-    _launch_bands(lists.scatter, bands, inputs, [in_place(cursor), view(instances, wp.int32), view(places, wp.int32)])
+    _launch_bands(lists.scatter, bands, [order, begins, row_ends, spans], [cursor, instances, places])
     ranges = torch.from_numpy(np.stack([np.concatenate([[0], ends[:-1]]), ends], 1).astype(np.int32))
     found = (instances, places, torch.from_numpy(begins), ranges, balanced_slices(ends))
     return Bins(len(radii), gaussians, splats, *found, tiles_x, camera.height, invalid, pictures)
@@ -106,8 +105,7 @@ def bin_by_sorting(
     listed, numbers = torch.sort(listed, stable=True)
     new = partial(torch.empty, dtype=torch.int32, device=device)
     instances, places, ranges = new(count), new(count), new(tiles_x * tiles_y * pictures, 2)
-    inputs = [view(listed, wp.dtype_from_torch(listed.dtype)), view(numbers, wp.int64), view(ranks, wp.int32)]
-    outputs = [view(numbers, wp.int32) for numbers in (instances, places, ranges)]
+    inputs, outputs = [listed, numbers, ranks], [instances, places, ranges]
     launch(make_gather_tiles(narrow), count + 1, inputs, outputs, device=device)
     if count > MAX_TILE:  # only then can one tile hold as many, and only then is it worth waiting for
         _check_longest(int((ranges[:, 1] - ranges[:, 0]).max()))
@@ -123,10 +121,9 @@ def _count_tiles(splats2d: Splats2D, camera: Camera, options: RasterOptions) -> 
     order = torch.sort(splats2d.depths.detach(), stable=True).indices
     gaussians, splats = empty(total, int, device), empty(total, Splat2D, device)
     counts = torch.empty(total, dtype=torch.int64, device=device)
-    inputs = [view(order, wp.int64), splats2d.view(), camera.width, camera.height, options.alpha_min]
-    inputs.append(int(options.extent == "square"))
-    kernel = make_count_tiles(falloff_of(options).reach_of)
-    launch(kernel, total, inputs, [gaussians, splats, view(counts, wp.int64)], device=device)
+    square, kernel = int(options.extent == "square"), make_count_tiles(falloff_of(options).reach_of)
+    inputs = [order, splats2d.view(), camera.width, camera.height, options.alpha_min, square]
+    launch(kernel, total, inputs, [gaussians, splats, counts], device=device)
     return gaussians, splats, counts
 
 
@@ -138,9 +135,9 @@ def _list_tiles(
     ``counts`` [N], or [0], are counted anew.
     """
     begins, ranks = (torch.empty(size, dtype=torch.int32, device=ends.device) for size in (len(ends) + 1, len(listed)))
-    inputs = [splats, camera.width, camera.height, int(options.extent == "square"), view(ends, wp.int64)]
-    outputs = [view(table, wp.dtype_from_torch(table.dtype)) for table in (begins, listed, ranks, counts)]
-    launch(make_list_tiles(listed.dtype == torch.int16), len(begins), inputs, outputs, device=ends.device)
+    kernel, outputs = make_list_tiles(listed.dtype == torch.int16), [begins, listed, ranks, counts]
+    inputs = [splats, camera.width, camera.height, int(options.extent == "square"), ends]
+    launch(kernel, len(begins), inputs, outputs, device=ends.device)
     return begins, ranks
 
 
@@ -162,7 +159,7 @@ def _count_bands(bounds: list[int], row_ends: np.ndarray, spans: wp.array, tiles
     """Where each band's instances of each tile go [B, T], after those of the bands before it; each tile's end [T]."""
     rows = [int(row_ends[bound - 1]) if bound else 0 for bound in bounds]
     changes = np.zeros((len(bounds) - 1, tiles + 1), dtype=np.int32)
-    _launch_bands(lists.count_tiles, rows, [spans], [in_place(changes)])
+    _launch_bands(lists.count_tiles, rows, [spans], [changes])
     counts = np.cumsum(changes[:, :-1], axis=1, dtype=np.int32)
     totals = counts.sum(0, dtype=np.int64)
     begins, ends = np.empty_like(counts), np.cumsum(totals)
@@ -243,10 +240,5 @@ def order_by_depth(depths: np.ndarray) -> np.ndarray:
 
 def _launch_bands(kernel: wp.Kernel, bounds: list[int], inputs: Sequence, outputs: Sequence) -> None:
     """Launch ``kernel`` on the bands between ``bounds``, one for each thread."""
-    bands = in_place(np.array(bounds, dtype=np.int32))
+    bands = np.array(bounds, dtype=np.int32)
     launch(kernel, len(bounds) - 1, [bands, *inputs], outputs, bounds=list(range(len(bounds))))
-
-
-def in_place(values: np.ndarray):
-    """The same memory for a kernel."""
-    return view(torch.from_numpy(values), wp.dtype_from_numpy(values.dtype))

@@ -30,12 +30,8 @@ class Blending:
         """Instances of each tile that a pixel blends, [T] int32."""
         return self.saved.count.flatten(1).amax(1).int()
 
-    def view_walk(self) -> list:
-        """Final transmittances and counts, as kernels take them."""
-        return self.driver.view_walk(self.saved.final, self.saved.count)
-
     def view_lists(self) -> list:
-        """What each tile lists and how opacities are cut, likewise."""
+        """What each tile lists and how opacities are cut, as kernels take them."""
         return [self.bins.view(blocks=self.saved.blocks), alphas_of(self.options)]
 
 

@@ -12,7 +12,7 @@ from warp_splat.kernels.bound import FAINT, SEEN, BoundView, Rules, make_spread
 from warp_splat.raster.data import Bins, Gaussians, Splats2D, falloff_of
 from warp_splat.raster.drivers import driver_of
 from warp_splat.raster.seam import Crossing, with_copies
-from warp_splat.runtime.launch import launch, pack_struct, view
+from warp_splat.runtime.launch import launch, pack_struct
 from warp_splat.runtime.pool import even_slices
 
 #: Where maps of depth begin, as shares of the Gaussians: most is hidden by what is near.
@@ -107,9 +107,7 @@ def certify(
         starts, bands = colors.new_tensor(begins), torch.tensor(bounds, **new)
         extents, radii = torch.empty_like(splats.extents), torch.empty_like(splats.radii)
         if count:
-            inputs = [view(bands, wp.int32), splats.view(), view(scales, wp.vec3), rules, view(starts, wp.float32)]
-            outputs = [view(maps, wp.int32), view(lost, wp.int32), view(extents, wp.vec2), view(radii, wp.int32)]
-            outputs.append(view(errors, wp.vec3))
+            inputs, outputs = [bands, splats.view(), scales, rules, starts], [maps, lost, extents, radii, errors]
             kernel, one_each = make_spread(falloff_of(options)), list(range(len(bounds))) if threads else None
             launch(kernel, len(bounds) - 1, inputs, outputs, bounds=one_each, device=device)
         outside = maps.sum(0, dtype=torch.int32).cumsum(1, dtype=torch.int32).cumsum(2, dtype=torch.int32)

@@ -10,8 +10,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import accumulate
 from types import ModuleType
-from typing import NamedTuple
 
+import numpy as np
 import torch
 import warp as wp
 
@@ -19,27 +19,15 @@ from warp_splat.camera import Camera
 from warp_splat.config import TILE, RasterOptions
 from warp_splat.kernels import cpu, cuda
 from warp_splat.kernels.cuda.warps import WARP
-from warp_splat.kernels.simd import LANES, vec16
+from warp_splat.kernels.simd import LANES
 from warp_splat.kernels.splat import Splat2D
 from warp_splat.kernels.structs import BinsView
 from warp_splat.kernels.tiles import count_in_front
 from warp_splat.raster import bin
 from warp_splat.raster.data import Bins, Pixels, Saved, alphas_of, limits_of, variant_of
-from warp_splat.runtime.launch import check_memory, empty, launch, launch_blocks, load, pack_struct, view
+from warp_splat.runtime.launch import check_memory, empty, launch, launch_blocks, load, pack_struct
 
 THREADS = TILE * TILE
-
-
-class TileLayout(NamedTuple):
-    """How kernels that take a tile hold what belongs to the pixels of a tile."""
-
-    shape: tuple[int, ...]  # of a number for each pixel
-    number: type  # an element of that, for kernels
-    count: type  # likewise, of a number of instances
-    counts: torch.dtype
-    upstream: type  # an element of the upstream gradients
-    upstream_shape: Callable[[int], tuple[int, ...]]  # of their tensor, by the number of channels
-    slot: Callable[[int], type]  # an element of the slots that are cleared, by their columns
 
 
 @dataclass(eq=False)
@@ -52,7 +40,9 @@ class Driver:
     gather: Callable[..., list[torch.Tensor]]
     launch_tiles: Callable[..., None]  # a kernel for each tile: kernel, bins, inputs, outputs
     kernels: ModuleType  # the package of those that take a tile: modules and makers have the same names in both
-    layout: TileLayout
+    shape: tuple[int, ...]  # of a number for each pixel of a tile, as its kernels have it
+    counts: torch.dtype  # of a number of instances there
+    upstream: Callable[[int], tuple[int, ...]]  # shape of the upstream gradients there, by the number of channels
 
     def blend(
         self, bins: Bins, camera: Camera, background: torch.Tensor, options: RasterOptions, keep: bool
@@ -66,21 +56,19 @@ class Driver:
             options: what to compute.
             keep: store every transmittance, for the adjoint "stored".
         """
-        tile_count, new, shape = len(bins.ranges), background.new_empty, self.layout.shape
+        tile_count, new, shape = len(bins.ranges), background.new_empty, self.shape
         size = camera.height, camera.width
         pixels = Pixels(new(*size, 3), new(*size), new(*size) if options.depth else new(0, 0))
-        final, count = new(tile_count, *shape), new(tile_count, *shape, dtype=self.layout.counts)
+        final, count = new(tile_count, *shape), new(tile_count, *shape, dtype=self.counts)
         blocks = new(len(bins.instances) if self.lanes > 1 else 0, dtype=torch.int32)
         saved = Saved(final, count, blocks, _room_for_states(bins).view(-1, *shape) if keep else new(0, *shape))
         limits = new(0 if options.hidden_from is None else tile_count, *shape)
         if options.hidden_from is not None:
-            inputs = [bins.view(), view(options.hidden_from.resolve_neg(), wp.float32), self.lanes]
-            outputs = [view(limits.view(-1, THREADS), wp.float32)]
+            inputs, outputs = [bins.view(), options.hidden_from.resolve_neg(), self.lanes], [limits.view(-1, THREADS)]
             launch(count_in_front, tile_count, inputs, outputs, bounds=bins.slices, device=background.device)
         variant = variant_of(options, keep, options.bound, options.hidden_from is not None)
-        inputs = [bins.view(blocks=blocks), alphas_of(options), *limits_of(options), view(background, wp.float32)]
-        inputs += [bins.bound, view(limits, self.layout.number)]
-        outputs = [pixels.view(), *self.view_walk(final, count, saved.kept)]
+        inputs = [bins.view(blocks=blocks), alphas_of(options), *limits_of(options), background, bins.bound, limits]
+        outputs = [pixels.view(), final, count, saved.kept]
         self.launch_tiles(self.kernels.blend.make_blend(variant), bins, inputs, outputs)
         return pixels, saved
 
@@ -113,14 +101,11 @@ class Driver:
         """
         tile_count, new = len(bins.ranges), background.new_empty
         variant = variant_of(options)
-        up = new(tile_count, *self.layout.upstream_shape(variant.channels))
+        up = new(tile_count, *self.upstream(variant.channels))
         adj_final, adj_background = torch.empty_like(saved.final), new(tile_count, 3)
         dropped, steps = (new(tile_count, dtype=torch.int32) for _ in range(2))
-        inputs = [bins.view(), view(background, wp.float32), *self.view_walk(saved.final, saved.count)]
-        outputs = [view(up, self.layout.upstream), view(adj_final, self.layout.number)]
-        outputs += [view(adj_background, wp.float32), view(dropped, wp.int32), view(steps, wp.int32)]
-        outputs.append(view(slots, self.layout.slot(slots.shape[1])))
-        inputs.append(adj_pixels.view())
+        inputs = [bins.view(), background, saved.final, saved.count, adj_pixels.view()]
+        outputs = [up, adj_final, adj_background, dropped, steps, slots]
         self.launch_tiles(self.kernels.adjoint.make_upstream(variant), bins, inputs, outputs)
         return (up, adj_final), adj_background, dropped, steps
 
@@ -128,30 +113,22 @@ class Driver:
         self, mode: str, bins: Bins, options: RasterOptions, saved: Saved, upstream, steps, slots: torch.Tensor
     ) -> None:
         """Fill ``slots`` [M, 9 or 10]; ``upstream`` and ``steps`` [T] are those of :meth:`spread_upstream`."""
-        final, count, kept = self.view_walk(saved.final, saved.count, saved.kept)
-        lists, steps, rows = bins.view(blocks=saved.blocks), view(steps, wp.int32), view(slots, wp.float32)
-        variant = variant_of(options)
-        upstream = [view(upstream[0], self.layout.upstream), view(upstream[1], self.layout.number)]
+        lists, variant = bins.view(blocks=saved.blocks), variant_of(options)
         if mode in ("manual", "stepwise"):
-            inputs = [lists, alphas_of(options), final, count, steps, *upstream]
-            self.launch_tiles(self.kernels.adjoint.make_reverse(mode, variant), bins, inputs, [rows])
+            inputs = [lists, alphas_of(options), saved.final, saved.count, steps, *upstream]
+            self.launch_tiles(self.kernels.adjoint.make_reverse(mode, variant), bins, inputs, [slots])
             return
-        inputs = [alphas_of(options), final, count, kept, steps, rows]
+        inputs = [alphas_of(options), saved.final, saved.count, saved.kept, steps, slots]
         if mode == "generated":
             copies, copies.grad = (empty(len(bins.instances), Splat2D, "cpu") for _ in range(2))
             copies.assign(bins.splats.numpy()[bins.instances.numpy()])
             copies.grad.zero_()
             lists.splats = copies
-        # ``upstream`` is what the kernel would write: its adjoint reads the gradients of that and writes ``rows``
+        # ``upstream`` is what the kernel would write: its adjoint reads the gradients of that and writes ``slots``
         adjoint = {"adj_inputs": [BinsView(), *[None] * len(inputs)], "adj_outputs": upstream}
         self.launch_tiles(self.kernels.taped.make_walk(mode, variant), bins, [lists, *inputs], upstream, **adjoint)
         if mode == "generated":
-            launch(cpu.taped.rows_of_copies, len(bins.instances), [lists.splats, lists.splats.grad], [rows])
-
-    def view_walk(self, final: torch.Tensor, count: torch.Tensor, *kept: torch.Tensor) -> list:
-        """Final transmittances, counts and kept transmittances, as kernels take them."""
-        numbers = [view(tensor, self.layout.number) for tensor in (final, *kept)]
-        return [numbers[0], view(count, self.layout.count), *numbers[1:]]
+            launch(cpu.taped.rows_of_copies, len(bins.instances), [lists.splats, lists.splats.grad], [slots])
 
 
 def _room_for_states(bins: Bins) -> torch.Tensor:
@@ -186,11 +163,10 @@ def gather_by_splat(bins: Bins, slots: torch.Tensor, grads: list[torch.Tensor] |
     """
     grads, width = grads or bins.new_gradients(slots), slots.shape[1]
     columns = [grad.data_ptr() + 4 * column for grad in grads for column in range(grad.shape[1])][:width]
-    addresses, widths = torch.tensor(columns), tuple(grad.shape[1] for grad in grads)
+    addresses, widths = np.array(columns, np.int64), tuple(grad.shape[1] for grad in grads)
     kernel = cpu.gather.make_gather(widths if sum(widths) == width else widths[:-1])
-    inputs = [bins.gaussian_count, bins.gaussians, view(bins.place_begins, wp.int32), view(bins.places, wp.int32)]
-    inputs += [view(slots, wp.types.vector(length=width, dtype=float)), 0.0]
-    launch(kernel, len(bins.place_begins) + 1, inputs, [view(addresses, wp.uint64)])
+    inputs = [bins.gaussian_count, bins.gaussians, bins.place_begins, bins.places, slots, 0.0]
+    launch(kernel, len(bins.place_begins) + 1, inputs, [addresses])
     return [grad.squeeze(1) for grad in grads]
 
 
@@ -201,7 +177,7 @@ def gather_by_warp(bins: Bins, slots: torch.Tensor, grads: list[torch.Tensor] | 
     tables = [grad for grad, end in zip(grads, ends, strict=True) if end <= slots.shape[1]]  # no depths, maybe
     filled = [*tables, *[slots.new_empty(0, 0)] * (len(views.vars) - len(tables))]
     tables_out = pack_struct(views, **dict(zip(views.vars, filled, strict=True)))
-    inputs = [bins.gaussians, view(bins.place_begins, wp.int32), view(bins.places, wp.int32), view(slots, wp.float32)]
+    inputs = [bins.gaussians, bins.place_begins, bins.places, slots]
     kernel = cuda.gather.make_gather(tuple(table.shape[1] for table in tables))
     launch_blocks(kernel, -(-len(bins.gaussians) // WARP), inputs, [tables_out], slots.device)
     return [grad.squeeze(1) for grad in grads]
@@ -209,21 +185,11 @@ def gather_by_warp(bins: Bins, slots: torch.Tensor, grads: list[torch.Tensor] | 
 
 CPU = Driver(
     *(LANES, True, bin.bin_by_counting, gather_by_splat, _launch_slices, cpu),
-    TileLayout(
-        (cpu.blend.BLOCKS, LANES),
-        *(vec16, vec16, torch.float32),
-        *(vec16, lambda channels: (cpu.blend.BLOCKS * channels, LANES)),
-        lambda columns: wp.types.vector(length=columns, dtype=float),
-    ),
+    *((cpu.blend.BLOCKS, LANES), torch.float32, lambda channels: (cpu.blend.BLOCKS * channels, LANES)),
 )
 CUDA = Driver(
     *(1, False, bin.bin_by_sorting, gather_by_warp, _launch_blocks, cuda),
-    TileLayout(
-        (THREADS,),
-        *(wp.float32, wp.int32, torch.int32),
-        *(wp.vec4, lambda _channels: (THREADS, 4)),
-        lambda _columns: wp.float32,
-    ),
+    *((THREADS,), torch.int32, lambda _channels: (THREADS, 4)),
 )
 #: By torch's name of the device.
 DRIVERS = {"cpu": CPU, "cuda": CUDA}

@@ -77,7 +77,7 @@ class _ColorMap(torch.autograd.Function):
             adj_image, lanes, device = torch.empty_like(image), driver_of(image.device).lanes, image.device
             inputs = [view(numbers.view(1, 12), vec12), image.view(-1, 3), adj.contiguous().view(-1, 3)]
             outputs, count = [adj_image.view(-1, 3)], image.numel() // 3
-            sums = launch_in_lanes(make_adj_map_colors, lanes, count, inputs, outputs, device, sums=(12, vec12))
+            sums = launch_in_lanes(make_adj_map_colors, lanes, count, inputs, outputs, device, sums=12)
             return adj_image, in_pairs(sums).to(numbers.dtype).nan_to_num(0.0, 0.0, 0.0)
 
 

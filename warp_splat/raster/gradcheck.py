@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 from numbers import Integral
 
 import torch
-import warp as wp
 
 from warp_splat.camera import Camera
 from warp_splat.config import ADJOINTS, RasterOptions
@@ -18,7 +17,7 @@ from warp_splat.kernels.falloff import Falloff, make_evaluate
 from warp_splat.raster import checks, differences
 from warp_splat.raster.camera_parameters import CameraParameters
 from warp_splat.raster.differences import INTERMEDIATES, RUNGS, SHAPES, MovableScene, Trial
-from warp_splat.runtime.launch import launch, view
+from warp_splat.runtime.launch import launch
 from warp_splat.text import format_table
 
 MODES = (*ADJOINTS, "generated", "plain")  # the last two, which rasterize refuses, are there to be compared
@@ -161,8 +160,7 @@ def _check_falloff(falloff: Falloff, device: torch.device) -> None:
 
     def at(q: torch.Tensor) -> tuple[list[float], torch.Tensor]:
         found = torch.empty_like(q), torch.empty_like(q)
-        arrays = [view(tensor, wp.float32) for tensor in (q, x, *found)]
-        launch(make_evaluate(falloff), len(q), arrays[:2], arrays[2:], device=device)
+        launch(make_evaluate(falloff), len(q), [q, x], found, device=device)
         return found[0].tolist(), found[1]
 
     falls, reaches = at(places)

@@ -21,14 +21,14 @@ from warp_splat.kernels.project.lens import LIMIT
 from warp_splat.kernels.project.quarantine import quarantine
 from warp_splat.kernels.project.shared import UNSEEN, make_project
 from warp_splat.kernels.sh_colors import make_adj_rest, make_adj_shade, make_shade
-from warp_splat.kernels.simd import TYPES, vec16
+from warp_splat.kernels.simd import vec16
 from warp_splat.kernels.structs import HarmonicsView
 from warp_splat.lenses import Lens
 from warp_splat.raster import camera_parameters as cameras
 from warp_splat.raster.camera_parameters import CameraParameters
 from warp_splat.raster.data import Dropped, Gaussians, Splats2D, falloff_of, plus
 from warp_splat.raster.drivers import Driver, driver_of
-from warp_splat.runtime.launch import arrays_of, bind, filled_up, launch, pack_struct, view
+from warp_splat.runtime.launch import bind, filled_up, grouped, launch, pack_struct
 from warp_splat.runtime.pool import even_slices, in_slices
 from warp_splat.runtime.timers import stage
 
@@ -139,27 +139,26 @@ def _geometry_of(
         [N / lanes, K]; else nothing.
     """
     lanes, count, motion, bend = it.driver.lanes, len(outputs[-1]), cameras.motion_of(it.camera), adj_inputs and it.bend
-    number, integer, row2, row3, row4 = TYPES[lanes]
-    types_in, types_out = (row3, row4, row3, number), (row2, row3, number, number, row2, integer)
     tables, whole, shared = (inputs, outputs, adj_inputs, adj_outputs), count // lanes, None
+    kernel, begin = (bend, 3) if bend else (it.kernel, 2)  # of the kernel's arguments, that of the means
     if bend or (adj_inputs and motion is not None):
         shared = inputs[0].new_zeros(-(-count // lanes), *((len(it.camera.lens.numbers),) if bend else (3, 4 * lanes)))
 
     def bound(given: Tensors, made: Tensors, adj_given: Tensors, adj_made: Tensors, groups: slice) -> Pass:
-        arrays, adj_arrays = [it.cam, *arrays_of(types_in, given)], [it.cam, *arrays_of(types_in, adj_given)]
+        arrays, adj_arrays = ([it.cam, *grouped(kernel, tensors, begin)] for tensors in (given, adj_given))
         grads = None if shared is None else shared[groups]
         if bend:
-            arrays.insert(0, view(grads.new_tensor(it.camera.lens.numbers).repeat(len(grads), 1), wp.float32))
-            adj_arrays.insert(0, view(grads, wp.float32))
+            arrays.insert(0, grads.new_tensor(it.camera.lens.numbers).repeat(len(grads), 1))
+            adj_arrays.insert(0, grads)
         elif motion is not None:
-            arrays[2] = view(cameras.with_motion(given[1], motion, lanes), row4)
-            adj_arrays[2:3] = [] if grads is None else [view(grads, row4)]
-        adj_out = [*arrays_of(types_out, adj_made[:4]), None, None]
+            arrays[2] = cameras.with_motion(given[1], motion, lanes)
+            adj_arrays[2:3] = [] if grads is None else [grads]
+        adj_out = [*grouped(kernel, adj_made[:4], begin + 4), None, None]
         adjoint = {"adj_inputs": adj_arrays, "adj_outputs": adj_out} if adj_inputs else {}
-        kernel = bind(bend or it.kernel, arrays, arrays_of(types_out, made), made[-1].device, **adjoint)
+        launched = bind(kernel, arrays, grouped(kernel, made, begin + 4), made[-1].device, **adjoint)
 
         def run(low: int, high: int) -> None:
-            kernel(low, high)
+            launched(low, high)
             if grads is not None and not bend:
                 quats = adj_given[1][lanes * low : lanes * high]
                 quats.copy_(grads[low:high, 0].reshape_as(quats))
@@ -211,7 +210,7 @@ class Project(torch.autograd.Function):
             radii=new(count, dtype=torch.int32),
         )
         geometry, _ = _geometry_of(it, gaussians[:4], _geometry(splats))
-        given = [it.cam, view(gaussians.means, wp.vec3), _harmonics(gaussians.sh_dc, gaussians.sh_rest)]
+        given = [it.cam, gaussians.means, _harmonics(gaussians.sh_dc, gaussians.sh_rest)]
         shade = bind(make_shade(lanes), given, [splats.view()], means.device)
         unseen: Pass = lambda low, high: splats.radii[lanes * low : lanes * high].fill_(int(UNSEEN))  # noqa: E731
         _in_turn([_clear(splats[:-1], lanes), unseen, geometry, shade], count, lanes, means.device)
@@ -237,16 +236,14 @@ class Project(torch.autograd.Function):
             ]
             adj_splats = Splats2D(*adj_splats, splats.extents, splats.radii)
             lanes, count, device = it.driver.lanes, len(given.means), given.means.device
-            seen, rest = view(splats.radii, wp.int32), given.sh_rest
+            rest = given.sh_rest
             adj_means, adj_dc, adj_rest = (torch.empty_like(tensor) for tensor in (given.means, given.sh_dc, rest))
-            tensors = (given.means, splats.colors, adj_splats.colors)
-            means, colors, adj_colors = (view(tensor, wp.vec3) for tensor in tensors)
-            inputs = [it.cam, means, _harmonics(given.sh_dc, rest), seen, colors, adj_colors]
-            outputs = [view(adj_means, wp.vec3), _harmonics(adj_dc, adj_rest)]
-            shade = bind(make_adj_shade(lanes), inputs, outputs, device)
+            colored = [splats.radii, splats.colors, adj_splats.colors]
+            inputs = [it.cam, given.means, _harmonics(given.sh_dc, rest), *colored]
+            shade = bind(make_adj_shade(lanes), inputs, [adj_means, _harmonics(adj_dc, adj_rest)], device)
             if lanes == 1 and rest.shape[1] > 0:
-                numbers = [it.cam, means, seen, colors, adj_colors], [view(adj_rest, wp.vec3)]
-                launch(make_adj_rest(), adj_rest[..., 0].numel(), *numbers, device=device)
+                inputs = [it.cam, given.means, *colored]
+                launch(make_adj_rest(), adj_rest[..., 0].numel(), inputs, [adj_rest], device=device)
             shapes = [torch.empty_like(tensor) for tensor in (given.quats, given.scales, given.opacities)]
             adj = Gaussians(adj_means, *shapes, adj_dc, adj_rest)
             adj_placed = torch.zeros_like(adj_means) if wants_pose else adj_means  # else added to the colors' part
@@ -281,9 +278,7 @@ class Project(torch.autograd.Function):
             # a GPU would have to stop for the answer; sh_rest's are multiples of those of sh_dc
             if not (it.driver.peeks and math.isfinite(sum(totals))):
                 bad = torch.zeros_like(splats.radii)
-                types = (wp.vec3, wp.vec4, wp.vec3, wp.float32, wp.vec3, wp.vec3, wp.int32)
-                outputs = [view(tensor, dtype) for tensor, dtype in zip((*adj, bad), types, strict=True)]
-                launch(quarantine, count, [seen], outputs, device=device)
+                launch(quarantine, count, [splats.radii], [*adj, bad], device=device)
                 it.dropped.gaussian_count = plus(it.dropped.gaussian_count, torch.count_nonzero(bad))
         wanted = zip(adj, ctx.needs_input_grad[: len(adj)], strict=True)
         learned = adj_twist, adj_intrinsics, adj_last, adj_coefficients

@@ -24,7 +24,7 @@ from warp_splat.raster.blend import Blending
 from warp_splat.raster.data import Bins
 from warp_splat.raster.drivers import driver_of
 from warp_splat.raster.project import project
-from warp_splat.runtime.launch import empty, launch, send, view
+from warp_splat.runtime.launch import empty, launch, send
 
 
 def takes(camera: Camera, options: RasterOptions) -> bool:
@@ -127,8 +127,8 @@ class Worlds:
         check_count(count := int(ends[-1]), self.camera, len(own.splats), device)
         ranges, instances = torch.stack([ends - lengths, ends], 1).int(), own.instances.new_empty(count)
         slices = balanced_slices(ends.numpy()) if own.slices else []
-        inputs = [back.view(), own.view(), view(ranges, wp.vec2i)]
-        launch(merge_lists, len(ranges), inputs, [view(instances, wp.int32)], bounds=slices, device=device)
+        inputs = [back.view(), own.view(), ranges]
+        launch(merge_lists, len(ranges), inputs, [instances], bounds=slices, device=device)
         splats = empty(len(back.splats) + len(own.splats), Splat2D, device)
         wp.copy(splats, back.splats)
         wp.copy(splats, own.splats, len(back.splats))

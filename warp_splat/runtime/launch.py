@@ -16,13 +16,13 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import Any
 
+import numpy as np
 import psutil
 import torch
 import warp as wp
 
 from warp_splat.errors import InputError
 from warp_splat.kernels.compiler import once
-from warp_splat.kernels.simd import TYPES, Types
 from warp_splat.runtime.devices import choose_device
 from warp_splat.runtime.pool import even_slices, in_slices, set_threads
 
@@ -103,7 +103,7 @@ def launch(
     Args:
         kernel: takes the first index of its slice before ``inputs``.
         dim: number of indices; nothing happens for 0.
-        inputs: Warp arrays, :func:`view` results, structs or scalars.
+        inputs: structs, scalars, Warp's arrays, torch's tensors and NumPy's arrays, seen as the kernel's types.
         outputs: likewise.
         bounds: bounds of the slices, by default one equal slice per thread; more slices than threads balance work.
         device: of the tensors behind ``inputs`` and ``outputs``.
@@ -121,13 +121,23 @@ def bind(
 
     So work on the same rows can share a slice, one after the other: threads wait for each other once, not each time.
     """
+    middle = 1 + len(inputs)
+    inputs, outputs = _viewed(kernel, inputs, 1), _viewed(kernel, outputs, middle)
     if adjoint:
-        adjoint = {"adjoint": True, "adj_inputs": [None, *adjoint["adj_inputs"]], "adj_outputs": adjoint["adj_outputs"]}
+        adj = [None, *_viewed(kernel, adjoint["adj_inputs"], 1)], _viewed(kernel, adjoint["adj_outputs"], middle)
+        adjoint = {"adjoint": True, "adj_inputs": adj[0], "adj_outputs": adj[1]}
     if torch.device(device).type == "cuda":
         options = {"stream": _stream(device), "record_tape": False, **adjoint}
         return lambda low, high: wp.launch(kernel, high - low, [low, *inputs], outputs, **options)
     load("cpu", kernel)
     return _bound(kernel, [0, *inputs], outputs, adjoint)
+
+
+def _viewed(kernel: wp.Kernel, values: Sequence, begin: int) -> list:
+    """Arguments of ``kernel`` from that at ``begin`` on, torch's tensors and NumPy's arrays seen as its types."""
+    given = (torch.from_numpy(value) if isinstance(value, np.ndarray) else value for value in values)
+    pairs = zip(kernel.adj.args[begin : begin + len(values)], given, strict=True)
+    return [view(value, a.type.dtype) if isinstance(value, torch.Tensor) else value for a, value in pairs]
 
 
 #: By kernel, and whether its adjoint: its module, which stays loaded; a function; tables of what that is given.
@@ -190,7 +200,7 @@ def launch_in_lanes(
     outputs: Sequence,
     device: torch.device | str = "cpu",
     run: int = 1,
-    sums: tuple[int, type] | None = None,
+    sums: int = 0,
 ) -> torch.Tensor:
     """Launch ``make(lanes)``, a kernel for so many rows at once, on ``count`` rows, ``make(1)`` on those left over.
 
@@ -198,25 +208,25 @@ def launch_in_lanes(
         make: of a number of lanes.
         lanes: of the device.
         count: of rows.
-        inputs: dense tensors of ``count`` rows of 1 to 4 numbers, functions of the kernel's types and a slice of the
-            rows, or what is the same for all.
+        inputs: dense tensors of ``count`` rows, or what is the same for all and no tensor.
         outputs: likewise.
         device: of the tensors.
         run: groups of rows that an index of the kernel takes.
-        sums: how many numbers each index writes besides, and their type for the kernel.
+        sums: how many numbers each index writes besides.
 
     Returns:
         Those numbers, a row for each index of both kernels; none, if not asked for.
     """
     whole = count - count % lanes
     most, left = -(-(whole // lanes) // run), -(-(count - whole) // run)
-    found = torch.empty(most + left, sums[0] if sums else 0, dtype=torch.float32, device=device)
+    found = torch.empty(most + left, sums, dtype=torch.float32, device=device)
     if count == 0:
         return found
 
     def bound(size: int, rows: slice, indices: slice) -> Callable[[int, int], object]:
-        given, made = ([_in_lanes(t, TYPES[size], count, rows) for t in tables] for tables in (inputs, outputs))
-        return bind(make(size), given, [*made, *([view(found[indices], sums[1])] if sums else [])], device)
+        kernel = make(size)
+        tables = [table[rows] if isinstance(table, torch.Tensor) else table for table in (*inputs, *outputs)]
+        return bind(kernel, grouped(kernel, tables), [found[indices]] if sums else [], device)
 
     def run_slice(low: int, high: int) -> None:
         if low < most:
@@ -227,15 +237,6 @@ def launch_in_lanes(
     in_groups = bound(lanes, slice(0, whole), slice(0, most))
     in_slices(run_slice, even_slices(most + left, each=lanes * run, device=device))
     return found
-
-
-def _in_lanes(table: Any, types: Types, count: int, rows: slice) -> Any:
-    """The part of a table that a kernel gets; see :func:`launch_in_lanes`."""
-    if isinstance(table, torch.Tensor):
-        narrow = types.integer if table.dtype == torch.int32 else types.number
-        by_width = {1: narrow, 2: types.row2, 3: types.row3, 4: types.row4}
-        return arrays_of([by_width[table.numel() // count]], [table[rows]])[0]
-    return table(types, rows) if callable(table) else table
 
 
 def send(values: torch.Tensor, device: torch.device) -> torch.Tensor:
@@ -268,10 +269,10 @@ def filled_up(tensor: torch.Tensor, rows: int) -> torch.Tensor:
     return torch.cat([tensor, tensor.new_zeros(missing, *tensor.shape[1:])]) if missing else tensor
 
 
-def arrays_of(types: Sequence[type], tensors: Sequence[torch.Tensor]) -> list:
-    """Dense tensors as arrays of these types, as many numbers in each element as its type has."""
-    given = [(tensor, getattr(dtype, "_shape_", ()), dtype) for tensor, dtype in zip(tensors, types, strict=False)]
-    return [view(t if t.shape[1:] == inner else t.view(-1, *inner), dtype) for t, inner, dtype in given]
+def grouped(kernel: wp.Kernel, values: Sequence, begin: int = 1) -> list:
+    """Arguments of ``kernel`` from the one at ``begin`` on; in a row of a tensor as many numbers as its type has."""
+    pairs = zip(kernel.adj.args[begin:], values, strict=False)
+    return [v.view(-1, *getattr(a.type.dtype, "_shape_", ())) if isinstance(v, torch.Tensor) else v for a, v in pairs]
 
 
 @once
@@ -295,7 +296,9 @@ def launch_blocks(
         return
     where = {"stream": _stream(device)} if torch.device(device).type == "cuda" else {"device": "cpu"}
     where |= {"block_dim": kernel.module.options["block_dim"], "record_tape": False, "adjoint": bool(adjoint)}
-    wp.launch_tiled(kernel, dim=[blocks], inputs=inputs, outputs=outputs, **where, **adjoint)
+    tables = {"inputs": inputs, "outputs": outputs, **adjoint}
+    given = {name: _viewed(kernel, tables[name], len(inputs) * name.endswith("outputs")) for name in tables}
+    wp.launch_tiled(kernel, dim=[blocks], **where, **given)
 
 
 def _stream(device: torch.device | str) -> wp.Stream:

@@ -4,13 +4,12 @@ from itertools import chain
 
 import numpy as np
 import torch
-import warp as wp
 
 from warp_splat.kernels.adam import make_adam
 from warp_splat.kernels.cuda import adam_by_number as numbered
 from warp_splat.kernels.simd import LANES
 from warp_splat.raster.drivers import driver_of
-from warp_splat.runtime.launch import launch, load, view
+from warp_splat.runtime.launch import launch, load
 from warp_splat.runtime.pool import falling_shares
 
 HALF = torch.bfloat16
@@ -39,17 +38,16 @@ def move(
 def _launch(tables: list, numbers: list, keys: list[int], count: int, radii: torch.Tensor | None) -> None:
     """On a CPU, sixteen rows at a time, then those left over; ``keys``: for rounding at random."""
     widths, halves = [table[0].numel() // count for table in tables], tables[0][-1].dtype == HALF
-    arrays = [view(torch.tensor(values, dtype=torch.int32, device="cpu"), wp.int32) for values in (widths, keys)]
-    arrays.append(view(torch.tensor(numbers, dtype=torch.float32, device="cpu"), wp.float32))
+    arrays = [np.array(widths, np.int32), np.array(keys, np.int32), np.array(numbers, np.float32)]
     for lanes, start, stop in ((LANES, 0, count - count % LANES), (1, count - count % LANES, count)):
         groups = (stop - start) // lanes
         # by their numbers, which the tables share out among them by their widths; each of a narrow one takes longer
         shares = falling_shares(stop - start) * sum(widths)
         bounds = np.interp(shares, np.cumsum([0, *widths]), range(len(tables) + 1)) * groups
-        addresses = torch.tensor(_addresses(tables, widths, start), dtype=torch.int64, device="cpu")
-        inputs = [groups, start, *arrays, arrays[0] if radii is None else view(radii[start:stop], wp.int32)]
-        outputs, kernel = [view(addresses, wp.uint64)], make_adam(lanes, radii is not None, halves)
-        launch(kernel, len(tables) * groups, inputs, outputs, bounds=[round(bound) for bound in bounds])
+        addresses = np.array(_addresses(tables, widths, start), np.int64)
+        inputs = [groups, start, *arrays, arrays[0] if radii is None else radii[start:stop]]
+        kernel = make_adam(lanes, radii is not None, halves)
+        launch(kernel, len(tables) * groups, inputs, [addresses], bounds=[round(bound) for bound in bounds])
 
 
 def _addresses(tables: list, widths: list[int], row: int) -> list[list[int]]:
@@ -65,7 +63,7 @@ def _launch_numbers(tables: list, numbers: list, keys: list[int], count: int, ra
     kernel = numbered.make_adam_by_number(radii is not None, tables[0][-1].dtype == HALF)
     shown = tables[0][0].new_empty(0, dtype=torch.int32) if radii is None else radii
     of_all = [numbered.vec_tables(*values, *[0] * missing) for values in (widths, keys)]
-    of_all += [numbered.mat_numbers(*chain(*numbers), *[0.0] * 7 * missing), view(shown, wp.int32)]
+    of_all += [numbered.mat_numbers(*chain(*numbers), *[0.0] * 7 * missing), shown]
     for start in range(0, count, MOST // max(widths)):
         rows = min(count - start, MOST // max(widths))
         outputs = [numbered.mat_addresses(*chain(*_addresses(tables, widths, start)), *[0] * 4 * missing)]

@@ -103,10 +103,8 @@ class ImageLoss(torch.autograd.Function):
             blurred, slopes = _lanes(bands, ROWS, groups, MOMENTS), _lanes(height, SLOPES, groups + 2)
             sums = image.new_empty(height, 2)
             pictures, missing = _pictures(image, limits, target, centers), _missing(groups, length)
-            inputs = [view(bounds, wp.int32), pictures, view(missing, vec16)]
-            outputs = [view(lanes, vec16) for lanes in (padded, ring, blurred)]
-            outputs += [view(sums, wp.float32), view(slopes, vec16)]
-            launch(ssim.compare, bands, inputs, outputs, bounds=list(range(bands + 1)))
+            outputs = [padded, ring, blurred, sums, slopes]
+            launch(ssim.compare, bands, [bounds, pictures, missing], outputs, bounds=list(range(bands + 1)))
             l1, similarity = sums.numpy().sum(0, dtype="float64") / (height * length)
             ctx.save_for_backward(image, target, slopes)
             ctx.lambda_dssim, ctx.limits, ctx.centers = lambda_dssim, limits, centers
@@ -123,8 +121,7 @@ class ImageLoss(torch.autograd.Function):
             adj, scale = torch.empty_like(image), adj_loss.item() / image.numel()
             weights = [scale * (1.0 - ctx.lambda_dssim), -scale * ctx.lambda_dssim]
             pictures = _pictures(image, ctx.limits, target, ctx.centers)
-            inputs = [view(bounds, wp.int32), pictures, view(slopes, vec16), *weights]
-            outputs = [view(ring, vec16), view(blurred, vec16), view(adj, wp.float32), _taps(adj)]
+            inputs, outputs = [bounds, pictures, slopes, *weights], [ring, blurred, adj, _taps(adj)]
             launch(ssim.adj_compare, bands, inputs, outputs, bounds=list(range(bands + 1)))
             return adj.view(height, -1, CHANNELS), None, None, None
 
@@ -141,8 +138,8 @@ class LossInBlocks(torch.autograd.Function):
             ctx.weights = wp.vec3((1.0 - lambda_dssim) / image.numel(), -lambda_dssim / image.numel(), lambda_dssim)
             ctx.blocks = -(-height // int(BAND)) * -(-length // int(STRIP))
             sums, ctx.slopes = image.new_empty(ctx.blocks), image.new_empty(SLOPES, height, length)
-            outputs = [view(sums, wp.float32), view(ctx.slopes, wp.float32)]
-            launch_blocks(compare_block, ctx.blocks, [_dense(*ctx.pictures), ctx.weights], outputs, image.device)
+            inputs, outputs = [_dense(*ctx.pictures), ctx.weights], [sums, ctx.slopes]
+            launch_blocks(compare_block, ctx.blocks, inputs, outputs, image.device)
             return sums.sum()
 
     @staticmethod
@@ -150,9 +147,8 @@ class LossInBlocks(torch.autograd.Function):
     def backward(ctx, adj_loss):
         with stage("adjoint of loss"):
             adj = torch.empty_like(ctx.pictures[0])
-            given = [view(ctx.slopes, wp.float32), view(adj_loss.reshape(1), wp.float32)]
-            inputs = [_dense(*ctx.pictures), ctx.weights, *given]
-            launch_blocks(adj_compare_block, ctx.blocks, inputs, [view(adj, wp.float32)], adj.device)
+            inputs = [_dense(*ctx.pictures), ctx.weights, ctx.slopes, adj_loss.reshape(1)]
+            launch_blocks(adj_compare_block, ctx.blocks, inputs, [adj], adj.device)
             return adj.view(len(adj), -1, 3), None, None, None
 
 
