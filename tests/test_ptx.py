@@ -59,7 +59,7 @@ def through_learned(lens) -> None:
 
 def observe() -> None:
     adj_means2d, radii = torch.randn(203, 2), torch.arange(203, dtype=torch.int32) % 3
-    launch_in_lanes(make_observe, 1, 203, [wp.vec2(20.0, 12.0), adj_means2d, radii], [*torch.rand(2, 203)], "cpu")
+    launch_in_lanes(make_observe, 1, [wp.vec2(20.0, 12.0), adj_means2d, radii], [*torch.rand(2, 203)])
 
 
 def list_many_tiles() -> None:

@@ -32,9 +32,9 @@ def activate(logarithms: torch.Tensor, logits: torch.Tensor) -> tuple[torch.Tens
 
 def _launched(make, *inputs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Two tensors of the shapes of the last two inputs."""
-    outputs, logits = [tensor.new_empty(tensor.shape) for tensor in inputs[-2:]], inputs[-1]
-    launch_in_lanes(make, driver_of(logits.device).lanes, len(logits), inputs, outputs, logits.device)
-    return outputs[0], outputs[1]
+    scales, opacities = (tensor.new_empty(tensor.shape) for tensor in inputs[-2:])
+    launch_in_lanes(make, driver_of(scales.device).lanes, inputs, [scales, opacities])
+    return scales, opacities
 
 
 class Activate(torch.autograd.Function):

@@ -76,7 +76,7 @@ class _PutBehind(torch.autograd.Function):
         ctx.save_for_backward(alpha, rays, behind)
         inputs = [ctx.rotation, view(harmonics.view(1, 48), vec48), rays, alpha.view(-1), image.view(-1, 3)]
         outputs, lanes = [behind.view(-1, 3), made.view(-1, 3)], driver_of(image.device).lanes
-        launch_in_lanes(make_put_behind, lanes, alpha.numel(), inputs, outputs, image.device)
+        launch_in_lanes(make_put_behind, lanes, inputs, outputs)
         return made
 
     @staticmethod
@@ -86,6 +86,5 @@ class _PutBehind(torch.autograd.Function):
             alpha, rays, behind = ctx.saved_tensors
             adj, adj_alpha, lanes = adj.contiguous(), torch.empty_like(alpha), driver_of(alpha.device).lanes
             inputs = [ctx.rotation, rays, alpha.view(-1), behind.view(-1, 3), adj.view(-1, 3)]
-            given = (make_adj_put_behind, lanes, alpha.numel(), inputs, [adj_alpha.view(-1)], alpha.device)
-            sums = launch_in_lanes(*given, run=RUN, sums=48)
+            sums = launch_in_lanes(make_adj_put_behind, lanes, inputs, [adj_alpha.view(-1)], run=RUN, sums=48)
             return adj, adj_alpha, in_pairs(sums).to(adj).view(-1, 3).nan_to_num(0.0, 0.0, 0.0), None, None

@@ -124,8 +124,7 @@ def _checked(name: str, tensor: torch.Tensor | None, start: list[float]) -> torc
 
 def sums_of(make: Callable[[int], wp.Kernel], lanes: int, columns: int, inputs: list) -> torch.Tensor:
     """The columns of what a kernel writes of all Gaussians, summed in pairs in float64, in one order everywhere."""
-    count, device = len(inputs[1]), inputs[1].device
-    return in_pairs(launch_in_lanes(make, lanes, count, inputs, [], device, sums=columns))
+    return in_pairs(launch_in_lanes(make, lanes, inputs, sums=columns))
 
 
 def twist_gradient(

@@ -64,9 +64,9 @@ class _ColorMap(torch.autograd.Function):
     def forward(ctx, image, numbers):
         image = image.detach().contiguous()
         ctx.save_for_backward(image, numbers)
-        mapped, lanes, count = torch.empty_like(image), driver_of(image.device).lanes, image.numel() // 3
+        mapped, lanes = torch.empty_like(image), driver_of(image.device).lanes
         inputs = [view(numbers.detach().view(1, 12), vec12), image.view(-1, 3)]
-        launch_in_lanes(make_map_colors, lanes, count, inputs, [mapped.view(-1, 3)], image.device)
+        launch_in_lanes(make_map_colors, lanes, inputs, [mapped.view(-1, 3)])
         return mapped
 
     @staticmethod
@@ -74,10 +74,9 @@ class _ColorMap(torch.autograd.Function):
     def backward(ctx, adj):
         with stage("adjoint of exposure"):
             image, numbers = ctx.saved_tensors
-            adj_image, lanes, device = torch.empty_like(image), driver_of(image.device).lanes, image.device
+            adj_image, lanes = torch.empty_like(image), driver_of(image.device).lanes
             inputs = [view(numbers.view(1, 12), vec12), image.view(-1, 3), adj.contiguous().view(-1, 3)]
-            outputs, count = [adj_image.view(-1, 3)], image.numel() // 3
-            sums = launch_in_lanes(make_adj_map_colors, lanes, count, inputs, outputs, device, sums=12)
+            sums = launch_in_lanes(make_adj_map_colors, lanes, inputs, [adj_image.view(-1, 3)], sums=12)
             return adj_image, in_pairs(sums).to(numbers.dtype).nan_to_num(0.0, 0.0, 0.0)
 
 

@@ -193,31 +193,23 @@ def launch_on_tape(kernel: wp.Kernel, dim: int, inputs: Sequence, outputs: Seque
 
 
 def launch_in_lanes(
-    make: Callable[[int], wp.Kernel],
-    lanes: int,
-    count: int,
-    inputs: Sequence,
-    outputs: Sequence,
-    device: torch.device | str = "cpu",
-    run: int = 1,
-    sums: int = 0,
+    make: Callable[[int], wp.Kernel], lanes: int, inputs: Sequence, outputs: Sequence = (), run: int = 1, sums: int = 0
 ) -> torch.Tensor:
-    """Launch ``make(lanes)``, a kernel for so many rows at once, on ``count`` rows, ``make(1)`` on those left over.
+    """Launch ``make(lanes)``, a kernel for so many rows at once, on rows of tensors, ``make(1)`` on those left over.
 
     Args:
         make: of a number of lanes.
         lanes: of the device.
-        count: of rows.
-        inputs: dense tensors of ``count`` rows, or what is the same for all and no tensor.
+        inputs: dense tensors of as many rows, or what is the same for all and no tensor.
         outputs: likewise.
-        device: of the tensors.
         run: groups of rows that an index of the kernel takes.
         sums: how many numbers each index writes besides.
 
     Returns:
         Those numbers, a row for each index of both kernels; none, if not asked for.
     """
-    whole = count - count % lanes
+    first = next(table for table in inputs if isinstance(table, torch.Tensor))
+    count, whole, device = len(first), len(first) - len(first) % lanes, first.device
     most, left = -(-(whole // lanes) // run), -(-(count - whole) // run)
     found = torch.empty(most + left, sums, dtype=torch.float32, device=device)
     if count == 0:

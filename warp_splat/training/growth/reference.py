@@ -58,8 +58,7 @@ class Reference:
         if grad is None or step.iteration >= self.options.densify_until_iter:
             return
         inputs = [wp.vec2(0.5 * width, 0.5 * height), grad, out.radii]
-        lanes, device = driver_of(grad.device).lanes, grad.device
-        launch_in_lanes(make_observe, lanes, len(grad), inputs, [self.gradient, self.views], device)
+        launch_in_lanes(make_observe, driver_of(grad.device).lanes, inputs, [self.gradient, self.views])
         if self.options.prune_screen_size:
             self.radius = torch.maximum(self.radius, out.radii)
 
