@@ -78,7 +78,7 @@ def modules() -> dict[str, wp.Module]:
         "adjoint of the map": make_adj_map_colors(1).module,
         "environment": make_put_behind(1).module,
         "adjoint of environment": make_adj_put_behind(1).module,
-        "count tiles": lists.make_count_tiles().module,
+        "count tiles": lists.make_count_tiles(reach_of).module,
         "list tiles": lists.make_list_tiles(True).module,
         "list tiles, many": lists.make_list_tiles(False).module,
         "gather tiles": lists.make_gather_tiles(True).module,

@@ -24,7 +24,6 @@ import warp as wp
 from warp_splat.config import TILE
 from warp_splat.kernels.compiler import FORWARD_ONLY, once
 from warp_splat.kernels.cpu.ahead import ask
-from warp_splat.kernels.falloff import reach_of
 from warp_splat.kernels.simd import LANES, vec16, vec16i
 from warp_splat.kernels.splat import Splat2D
 from warp_splat.kernels.structs import Splats2DView
@@ -36,7 +35,7 @@ AHEAD = wp.constant(32)  # rounds for which memory is asked before
 
 
 @once
-def make_pack(reach_of: wp.Function = reach_of) -> wp.Kernel:
+def make_pack(reach_of: wp.Function) -> wp.Kernel:
     """Splats as the blends read them, and how many rows of tiles each has; ``reach_of``: where their falloff ends."""
     shaped = make_shaped(reach_of, LANES)
 

@@ -12,7 +12,6 @@ import warp as wp
 
 from warp_splat.config import TILE
 from warp_splat.kernels.compiler import once
-from warp_splat.kernels.falloff import reach_of
 from warp_splat.kernels.splat import Splat2D
 from warp_splat.kernels.structs import Splats2DView
 from warp_splat.kernels.tiles import MARGIN, SPELLED_OUT, cut, make_shaped, outline, packed, pixels
@@ -37,7 +36,7 @@ def tiles_of_row(splat: Splat2D, row: int, width: int, square: int):
 
 
 @once
-def make_count_tiles(reach_of: wp.Function = reach_of) -> wp.Kernel:
+def make_count_tiles(reach_of: wp.Function) -> wp.Kernel:
     """Splats by rank, and the tiles of each; ``reach_of`` says where their falloff ends."""
     shaped = make_shaped(reach_of, 1)
 
