@@ -22,7 +22,7 @@ from warp_splat.kernels.splat import BlendVariant
 from warp_splat.raster.data import Gaussians, Pixels, alphas_of, variant_of
 from warp_splat.raster.drivers import CUDA, THREADS
 from warp_splat.raster.project import project
-from warp_splat.runtime.launch import launch, launch_blocks, view
+from warp_splat.runtime.launch import launch, launch_blocks
 
 #: Floating-point operations for one Gaussian at one pixel (operators of splat.py, falloff.py and step.py).
 #: Forward: offset 2, exponent 7, exponential 14, alpha 3, transmittance and weight 6, color 6, stop 1.
@@ -94,10 +94,8 @@ class Blends:
         (self.up, self.adj_final), _, _, self.steps = found
 
     def reverse(self, kernel: wp.Kernel, rows: torch.Tensor) -> None:
-        states = [*CUDA.view_walk(*self.saved[:2]), view(self.steps, wp.int32)]
-        upstream = [view(self.up, wp.vec4), view(self.adj_final, wp.float32)]
-        inputs = [self.bins.view(), alphas_of(self.options), *states, *upstream]
-        launch_blocks(kernel, len(self.bins.ranges), inputs, [view(rows, wp.float32)], rows.device)
+        inputs = [self.bins.view(), alphas_of(self.options), *self.saved[:2], self.steps, self.up, self.adj_final]
+        launch_blocks(kernel, len(self.bins.ranges), inputs, [rows], rows.device)
 
     def into_slots(self) -> None:
         self.reverse(adjoint.make_reverse("manual", variant_of(self.options)), self.slots)
@@ -130,8 +128,7 @@ def card_rates(device: str, count: int, rounds: int) -> tuple[float, float]:
     target = torch.empty_like(source)
     copying = milliseconds(lambda: target.copy_(source), device, 10)
     threads = min(count, 2**20)
-    values = [view(source, wp.vec4)]
-    adding = milliseconds(lambda: launch(multiply_add, threads, [rounds, 0.5], values, device=device), device, 10)
+    adding = milliseconds(lambda: launch(multiply_add, threads, [rounds, 0.5], [source], device=device), device, 10)
     return 32e3 * count / copying, 2e3 * CHAINS * UNROLLED * rounds * threads / adding
 
 

@@ -53,8 +53,7 @@ def test_atomics_and_slots_give_the_gradients_of_the_product(monkeypatch):
 
 def test_operations_of_the_card_are_counted_as_they_are_done():
     values = torch.zeros(3, 4)
-    arguments = [gpu_blends.view(values, wp.vec4)]
-    gpu_blends.launch(gpu_blends.multiply_add, 3, [2, 1.0], arguments)
+    gpu_blends.launch(gpu_blends.multiply_add, 3, [2, 1.0], [values])
     assert (values == 2 * gpu_blends.UNROLLED).all() and values.shape[1] == gpu_blends.CHAINS
 
 
