@@ -253,7 +253,7 @@ def test_a_whole_training_by_the_clock_is_repeated_by_its_options(tmp_path, ran)
     assert len(first) <= max(options["iterations"] // 50, 1)  # evaluations take no large part of so short a time
 
 
-@pytest.mark.parametrize("images", [1, 4])
+@pytest.mark.parametrize("images", [4, 7, 9])
 def test_a_plan_has_whole_steps(scene, monkeypatch, images):
     """Else the same options, which round up to them, would train otherwise."""
     monkeypatch.setattr("warp_splat.training.deadline.cost_of", lambda *_: COST)

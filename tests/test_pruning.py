@@ -10,6 +10,7 @@ import torch
 from commands import changes_told, no_space
 from scenes import C0, SCENES
 from scipy.spatial.transform import Rotation
+from splat_files import some_splats
 
 from warp_splat.cli import main
 from warp_splat.compare.scenes import make_camera
@@ -23,7 +24,7 @@ from warp_splat.pruning.clean import floaters
 from warp_splat.pruning.opened import Opened
 from warp_splat.pruning.score import ViewSetting, carried, costs, weights
 from warp_splat.pruning.simplify import bytes_of, degrees_of, fewer_harmonics
-from warp_splat.pruning.thinning import Thinning
+from warp_splat.pruning.thinning import Thinning, _config
 from warp_splat.raster.api import render
 from warp_splat.scene import load_scene
 from warp_splat.scene.embedded import embedded_scene
@@ -276,6 +277,14 @@ def test_what_a_file_has_no_room_for_counts(folder, tmp_path, ran, monkeypatch, 
     assert "That is more than --max_loss" in said
     save_gaussians(ply_path(tmp_path, 7), SplatFile(splats))  # whose harmonics are zeros
     assert "all harmonics" not in ran("simplify", tmp_path, "--tolerance", 0.3, *output)
+
+
+@pytest.mark.parametrize("there", [True, False])
+def test_maps_of_depth_are_those_of_the_training(tmp_path, there):
+    """A scene without tracks has no other depths; without the folder, those of tracks are left."""
+    trained = {"parts": "depth,pose", "depths": str(tmp_path / "" if there else tmp_path / "gone")}
+    config = _config(SplatFile(some_splats(3)), 5, 0, trained, torch.device("cpu"))
+    assert config.model.parts == "depth" and config.flat()["depths"] == (str(tmp_path) if there else "")
 
 
 @pytest.mark.long

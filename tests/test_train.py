@@ -16,10 +16,12 @@ from splat_files import some_file
 from warp_splat.cli import main
 from warp_splat.config import CORES
 from warp_splat.evaluation.metrics import psnr
+from warp_splat.formats.checkpoint import load_checkpoint
 from warp_splat.formats.exchange import load_gaussians, save_gaussians
 from warp_splat.formats.model_folder import ply_path, read_cfg_args
 from warp_splat.formats.ply import load_ply, save_ply_parts
 from warp_splat.formats.png import load_png
+from warp_splat.gaussians import GaussianModel
 from warp_splat.raster.drivers import CPU
 from warp_splat.training.loss import image_loss
 from warp_splat.training.optimizer import Optimizer
@@ -142,6 +144,25 @@ def test_ctrl_c_saves_the_model_and_says_how_to_continue(tmp_path, capsys):
     assert continued == f"{sys.executable} train.py --resume {tmp_path}"
     assert main(["train", *continued.split()[2:], "--iterations", f"{int(reached) + 5}"]) == 0
     assert f"Done after {int(reached) + 5} iterations" in capsys.readouterr().out
+
+
+def test_the_end_of_a_settled_training_is_written_again(tmp_path):
+    """Also where that is in the middle of its last step."""
+    assert train(tmp_path, "--views", "4", "--settle_from_iter", "9", "--cooldown", "5", "-r", "8") == 0
+    assert ply_path(tmp_path, 16).exists() and main(["train", "--resume", str(tmp_path)]) == 0
+
+
+def test_resume_without_the_points_that_were_near_cameras(scene, tmp_path):
+    """They made the extent smaller, which the checkpoint knows."""
+    centers = np.stack([view.camera.center + 0.3 * view.camera.forward for view in scene.train])
+    means = np.repeat(centers, 60, 0).astype(np.float32)
+    start, folder = tmp_path / "start.ply", tmp_path / "model"
+    GaussianModel.from_points(means, np.zeros(means.shape, np.uint8), 0).save(start)
+    options = "-r", "8", "--iterations", "2", "--start_ply", str(start)
+    assert train(folder, *options) == 0
+    assert load_checkpoint(folder).facts["extent"] < scene.extent
+    start.unlink()
+    assert main(["train", "--resume", str(folder), "--iterations", "4", "--quiet"]) == 0
 
 
 def test_first_step_loads_only_what_it_needs():
