@@ -15,7 +15,7 @@ from splat_files import small_splats
 from trainings import begin, stepped, steps
 
 from warp_splat.camera import Camera
-from warp_splat.color import from_srgb, to_srgb
+from warp_splat.color import COLOR_MAPS, from_srgb, to_srgb
 from warp_splat.errors import InputError
 from warp_splat.formats.exposures import Exposures, read_exposures
 from warp_splat.formats.model_folder import ply_path
@@ -350,3 +350,18 @@ def test_training_shows_what_it_compares(options, scene, tmp_path):
     expected = part.image(image, None, SimpleNamespace(view=view)).detach()
     assert torch.equal(as_photographed(exposures, image, view.name), expected)
     assert as_photographed(exposures, image, "another") is image
+
+
+@pytest.mark.parametrize("kind", ["gain", "affine"])
+def test_what_a_model_has_of_exposures_is_not_learned_again(scene, tmp_path, kind):
+    """As simplify and clean train it; of another kind, all is learned anew."""
+    trainer, run = begin(scene, tmp_path, parts="exposure", exposure="gain")
+    (part,) = trainer.parts
+    shape, random = COLOR_MAPS[kind], np.random.default_rng(0)
+    maps = {view.name: random.normal(0, 0.1, shape).astype(np.float32) for view in scene.train}
+    part.begin(Exposures(kind, part.pivot, np.zeros(2, np.float32), maps))
+    before = part.maps.detach().clone()
+    steps(trainer, run, 5)
+    trainer.update(5)
+    kept = torch.equal(part.maps, before)
+    assert kept == (kind == "gain") and before.any() == kept

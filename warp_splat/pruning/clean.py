@@ -41,7 +41,7 @@ def clean(config: CleanConfig) -> int:
     if config.steps:
         parts = {*str(opened.trained.get("parts", "")).split(","), "floaters"}
         trained = {**opened.trained, "parts": ",".join(sorted(parts))}
-        splats = tuned(opened.scene, left, opened.setting, len(splats.means), config.steps, trained)
+        splats = tuned(opened.scene, left, opened.setting, len(splats.means), config.steps, trained, opened.exposures)
     saved = write(output, opened, splats)
     opened.print_quality(before, saved)
     sheet = output.with_suffix(".sheet.png")

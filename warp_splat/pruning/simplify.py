@@ -53,7 +53,7 @@ def simplify(config: SimplifyConfig) -> int:
     def made(count: int) -> SplatArrays:
         if not config.steps:
             return thinning.to(count)
-        return tuned(opened.scene, file, opened.setting, count, config.steps, opened.trained)
+        return tuned(opened.scene, file, opened.setting, count, config.steps, opened.trained, opened.exposures)
 
     total, views = len(file.splats.means), opened.scene.train
     enough = opened.psnr(whole, views) - config.max_loss if config.max_loss else -math.inf

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from warp_splat.flags import fits, flags_of
+from warp_splat.formats.exposures import Exposures
 from warp_splat.formats.splats import COEFFICIENTS, SplatArrays, SplatFile
 from warp_splat.gaussians import GaussianModel
 from warp_splat.presets import TRIPLED
@@ -15,6 +16,7 @@ from warp_splat.pruning.score import ViewSetting, costs
 from warp_splat.scene.types import Scene
 from warp_splat.training.options import TrainConfig
 from warp_splat.training.parts import PARTS
+from warp_splat.training.seams import having
 from warp_splat.training.trainer import Trainer
 
 AT_ONCE = 0.8  # of the Gaussians stay, at least, before the rest is judged again: of two that are alike one is needed
@@ -67,7 +69,15 @@ def _costliest(model: GaussianModel, setting: ViewSetting, count: int) -> torch.
     return torch.sort(order[:count]).values
 
 
-def tuned(scene: Scene, file: SplatFile, setting: ViewSetting, count: int, steps: int, trained: dict) -> SplatArrays:
+def tuned(
+    scene: Scene,
+    file: SplatFile,
+    setting: ViewSetting,
+    count: int,
+    steps: int,
+    trained: dict,
+    exposures: Exposures | None,
+) -> SplatArrays:
     """The model in ``count`` Gaussians, which ``steps`` of training adapt; they are left out by and by.
 
     Args:
@@ -77,10 +87,13 @@ def tuned(scene: Scene, file: SplatFile, setting: ViewSetting, count: int, steps
         count: of Gaussians to keep.
         steps: of training.
         trained: options of the model's training.
+        exposures: that it found.
     """
     degree = COEFFICIENTS.index(file.splats.sh.shape[1])
     trainer = Trainer(replace(scene, start=file), _config(file, steps, degree, trained, setting.background.device))
     trainer.background = setting.background
+    for begin in having(trainer.parts, "begin") if exposures else ():
+        begin(exposures)
     total = len(trainer.model)
     for number in range(1, steps + 1):
         stage = math.ceil(number / max(1, THINNED * steps / STAGES))

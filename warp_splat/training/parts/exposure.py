@@ -49,6 +49,15 @@ class Exposure:
         self.falloff = torch.zeros(2, device=device, requires_grad=True)
         self.found: Exposures | None = None  # since the last step
 
+    @torch.no_grad()
+    def begin(self, found: Exposures) -> None:
+        """Take what a training of the same kind found of these photographs, and leave it so."""
+        if found.kind == self.kind and all(view.name in found.maps for view in self.places):
+            self.maps.copy_(torch.from_numpy(np.stack([found.maps[view.name] for view in self.places])))
+            self.falloff.copy_(torch.from_numpy(found.falloff))
+            for table in (self.maps, self.falloff):
+                table.requires_grad_(False)
+
     @classmethod
     def needed(cls, scene: Scene) -> Verdict:
         """If photographs differ in brightness or tint, as the colors of points in them tell."""
@@ -113,6 +122,8 @@ class Exposure:
     @torch.no_grad()
     def after_step(self, iteration: int) -> None:
         """Take the mean over the photographs off, exactly."""
+        if not self.maps.requires_grad:
+            return
         units = (self.maps / UNIT).round().long()
         mean = units.sum(0).div(len(units), rounding_mode="floor")
         left = units.sum(0) - len(units) * mean  # fewer than there are photographs
