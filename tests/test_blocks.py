@@ -38,6 +38,14 @@ def test_each_place_has_one_owner_and_each_block_its_share(count):
     assert len(np.unique(up)) == 2
 
 
+def test_what_is_seen_from_above_is_cut_along_the_ground():
+    """Where coordinates say that y is down, whatever cameras take for up."""
+    points = np.random.default_rng(0).uniform(-1, 1, (10_000, 3)) * (100, 2, 1000)
+    down = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    cells = block_of("1/4", points, [Camera(8, 8, 8.0, 8.0, 4.0, 4.0, down, np.zeros(3))], True).cells
+    np.testing.assert_allclose(np.sort(cells[:, 1, 2])[:-1], (-500, 0, 500), atol=50)  # across the longer side
+
+
 @pytest.fixture
 def two_things(tmp_path):
     """Two clouds of points far apart, three photographs of each, and one between them that shows the second one."""

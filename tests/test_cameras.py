@@ -97,6 +97,20 @@ def scene_of(cameras):
     return Scene(views, [], points, np.zeros((50, 3), np.uint8))
 
 
+@pytest.mark.parametrize("tilt", [0.0, 0.01])
+def test_axes_that_are_nearly_parallel_are_at_their_points(tilt):
+    """Of cameras 60 m above flat ground, they cross anywhere, or nowhere."""
+    random, down = np.random.default_rng(0), np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    cameras = []
+    for x, z in random.uniform(-200, 200, (60, 2)):
+        turn = Rotation.from_rotvec(tilt * random.normal(size=3)).as_matrix() @ down
+        cameras.append(replace(LENS, rotation=turn, translation=-turn @ (x, -60.0, z)))
+    points = random.uniform(-200, 200, (5000, 3)) * (1, 0.01, 1)
+    scene = replace(scene_of(cameras), points=points.astype(np.float32), colors=np.zeros((5000, 3), np.uint8))
+    center, _, distance = camera_paths.focus_point(scene)
+    assert abs(center[1]) < 3 and np.abs(center).max() < 60 and 60 < distance < 400
+
+
 def circle(count, radius=3.0, turn=1.5 * np.pi):
     """Cameras on a part of a circle around the origin, looking at it from above."""
     angles = np.linspace(0, turn, count)

@@ -157,6 +157,7 @@ def test_a_full_disk_leaves_no_part_of_a_file(tmp_path, ending, left):
 def ended_while_it_writes(number, *arguments):
     """A command that a signal reaches once its file is written, before that has its name."""
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's "&" has it ignored
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)  # as nohup has this
     os.replace = lambda *_: os.kill(os.getpid(), number)
     sys.exit(main([*arguments]))
 

@@ -246,6 +246,10 @@ def test_colors_are_those_of_photographs_in_the_mean_exposure():
     found = photographed(torch.from_numpy(image), view, exposures).numpy() - image
     assert np.abs(found[:3, :4]).max() < 0.003 and not found[3:].any()
     assert np.abs(found[:3, 4:] - 20 / 255).max() < 0.003 and np.abs(exposed - image).max() > 0.01
+    bright = np.full_like(taken, 255)
+    brighter = exposures._replace(maps={"a": np.float32([*np.eye(3), [0.0] * 3]).ravel()})
+    white = photographed(torch.full((6, 8, 3), 0.9), replace(view, photograph=Decoded(bright)), brighter)
+    np.testing.assert_allclose(white, 0.9, atol=1e-6)  # not 0.1: a photograph saturates
     bent = replace(view, camera=replace(camera, lens=Lens("OPENCV", (0.1, 0.0, 0.0, 0.0))))
     assert not (photographed(torch.from_numpy(image), bent, exposures).numpy() - image).any()
 

@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -65,6 +66,16 @@ def test_what_cannot_be_seen_is_left_out_and_the_large_and_opaque_are_kept():
     splats.opacities[20:23] = 3.0
     np.testing.assert_array_equal(shown(splats, 3).means[0], splats.means[20])
     assert len(shown(splats, 3).means) == 3 and len(shown(splats, 1000).means) == 89
+
+
+def test_up_is_as_coordinates_say(tmp_path):
+    """Cameras that look down tell where north is."""
+    save_gaussians(ply_path(tmp_path, 5), SplatFile(some_splats(9), coordinates={"origin": [0.0, 0.0, 0.0]}))
+    down = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    views = [replace(view, original=replace(view.camera, rotation=down)) for view in some_scene().train]
+    write_cameras(tmp_path, [], views)
+    assert main(["export-html", str(tmp_path), str(tmp_path / "a.html")]) == 0
+    assert json.loads(Blocks((tmp_path / "a.html").read_text()).found["scene"])["up"] == [0, -1, 0]
 
 
 def test_names_of_strangers_are_text():

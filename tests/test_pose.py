@@ -182,6 +182,15 @@ def test_a_model_that_shows_nothing_leads_nowhere_far():
     assert degrees == pytest.approx(np.degrees(alignment.FARTHEST)) and meters < 1e-9
 
 
+def test_what_saturates_moves_nothing():
+    """A photograph ends at white, whatever the light was."""
+    camera = made_cameras.looking()
+    white = np.full((camera.height, camera.width, 3), 255, np.uint8)
+    start = View("a.png", camera, Decoded(white), camera)
+    draw = lambda learned: (1.5 + learned.twist[0] / 100).float().expand(*white.shape)  # noqa: E731
+    assert made_cameras.distance(find_pose(draw, start, 1.0, False), camera)[:2] == (0, 0)
+
+
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
     """Held-out poses are refined in a few steps, which is enough to be better."""

@@ -23,7 +23,7 @@ from warp_splat.gaussians import GaussianModel
 from warp_splat.pruning.clean import floaters
 from warp_splat.pruning.opened import Opened
 from warp_splat.pruning.score import ViewSetting, carried, costs, weights
-from warp_splat.pruning.simplify import bytes_of, degrees_of, fewer_harmonics
+from warp_splat.pruning.simplify import _narrowed, bytes_of, degrees_of, fewer_harmonics
 from warp_splat.pruning.thinning import Thinning, _config
 from warp_splat.raster.api import render
 from warp_splat.scene import load_scene
@@ -277,6 +277,21 @@ def test_what_a_file_has_no_room_for_counts(folder, tmp_path, ran, monkeypatch, 
     assert "That is more than --max_loss" in said
     save_gaussians(ply_path(tmp_path, 7), SplatFile(splats))  # whose harmonics are zeros
     assert "all harmonics" not in ran("simplify", tmp_path, "--tolerance", 0.3, *output)
+
+
+def test_a_small_part_of_a_model_is_found():
+    """And a large one after as few tries as before."""
+    tried = []
+    fits = lambda count: tried.append(count) or count <= 54  # noqa: E731
+    assert _narrowed(1, 4500, fits, 19)[0] == 54
+    tried.clear()
+    assert 2900 <= _narrowed(1, 4500, lambda count: tried.append(count) or count <= 3000)[0] <= 3000 and len(tried) <= 6
+
+
+@pytest.mark.parametrize("steps", [1, 4])
+def test_a_few_steps_leave_as_many_as_asked_for(folder, tmp_path, ran, steps):
+    ran("simplify", folder[0], "--keep", 0.5, "--steps", steps, "--device", "cpu", "-o", tmp_path / "a.ply")
+    assert len(load_gaussians(tmp_path / "a.ply").splats.means) == round(0.5 * len(folder[1].means))
 
 
 @pytest.mark.parametrize("there", [True, False])

@@ -118,10 +118,13 @@ def test_the_share_of_sky_of_a_plain(roll, scene, monkeypatch):
     monkeypatch.setattr("warp_splat.scene.horizon.POINTS", 10**6)
     turns = [np.eye(3)] * 3 + [turn, turn.T]
     cameras = [Camera(240, 240, 120, 120, 120, 120, rotation @ level, np.zeros(3)) for rotation in turns]
-    share = share_of_sky(cameras, ground)
+    up = np.array([0.0, 0.0, 1.0])
+    share = share_of_sky(cameras, ground, up)
     assert share == pytest.approx((12 - 1) / 24, abs=1e-9)
     wall = np.stack([x.ravel(), np.full(x.size, 400.0), y.ravel() * 1.5], 1)  # a ceiling would do as well
-    assert share_of_sky(cameras, np.concatenate([ground, wall])) < share / 2
+    assert share_of_sky(cameras, np.concatenate([ground, wall]), up) < share / 2
+    down = [Camera(240, 240, 120, 120, 120, 120, np.diag([1.0, -1.0, -1.0]), np.array([0, 0, 5.0]))]
+    assert share_of_sky(down, ground[ground[:, 1] > 5], up) == 0
 
 
 def test_auto_tells_how_much_sky_there_is(scene, tmp_path):

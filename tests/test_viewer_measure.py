@@ -40,6 +40,16 @@ def test_a_click_finds_what_it_shows(draw, lens):
     assert point_at(draw, camera, (0.02, 0.02)) is None
 
 
+def test_a_click_has_the_depth_of_its_own_pixel(draw):
+    """To the last pixel of a ball."""
+    depth = draw(PHOTO, median=True).median_depth.numpy()
+    x, y = (places_of(PHOTO)[0] * (PHOTO.width, PHOTO.height)).astype(int)
+    places = [(x + dx, y + dy) for dx in range(-14, 15, 2) for dy in range(-14, 15, 2)]
+    found = [point_at(draw, PHOTO, ((x + 0.5) / PHOTO.width, (y + 0.5) / PHOTO.height)) for x, y in places]
+    shown = [depth[y, x] > 0 for x, y in places]
+    assert [point is not None for point in found] == shown and len(set(shown)) == 2
+
+
 def test_two_clicks_are_a_distance_and_two_corners_a_box(draw, fake_viser, monkeypatch):
     at_rest(monkeypatch)
     model = GaussianModel.from_splats(some_splats(2)._replace(means=np.float32(PLACES)))

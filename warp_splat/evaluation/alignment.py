@@ -48,8 +48,8 @@ def find_pose(draw: Callable[[CameraParameters], torch.Tensor], view: View, exte
 
     def loss(numbers: np.ndarray) -> tuple[float, np.ndarray]:
         twist = torch.from_numpy(numbers).requires_grad_()
-        image = draw(CameraParameters(camera, twist * units))
-        image = to_srgb(image.clamp(0.0, 1.0), torch.where) if linear else image
+        image = draw(CameraParameters(camera, twist * units)).clamp_max(1.0)
+        image = to_srgb(image.clamp_min(0.0), torch.where) if linear else image
         difference = ((image - photo.to(image.device)) * mask.to(image.device)).permute(2, 0, 1)
         levels = [level for level in LEVELS if level <= min(difference.shape[1:])]
         errors = torch.stack([avg_pool2d(difference, level).square().mean() for level in levels]).sum()

@@ -229,7 +229,7 @@ def _shorten(name: str, inches: float) -> str:
 def plain_axes(axes: Axes, title: str, x: str = "") -> None:
     """The look of all plots: a bold title in place of a label, few lines, a faint grid; ``x`` is told below."""
     axes.set_xlabel(x, fontsize=9, color=INK)
-    axes.set_title(title, loc="left", fontsize=10, fontweight="bold", color=INK)
+    axes.set_title(title, loc="left", fontsize=10, fontweight="bold", color=INK, parse_math=False)  # of a path, maybe
     axes.spines[["top", "right", "left"]].set_visible(False)
     axes.spines["bottom"].set_color(FAINT)
     axes.tick_params(labelsize=9, labelcolor=INK, color=FAINT)

@@ -18,6 +18,7 @@ from warp_splat.errors import InputError
 from warp_splat.export_html import pack
 from warp_splat.export_html.merge import merged
 from warp_splat.formats import model_folder
+from warp_splat.formats.coordinates import UP, read_coordinates
 from warp_splat.formats.exposures import read_exposures
 from warp_splat.formats.files import write_text
 from warp_splat.formats.splats import SplatArrays
@@ -41,10 +42,11 @@ def export_html(config: ExportHtmlConfig) -> int:
     """
     path = Path(config.page)
     model_folder.check_output(path, endings=(".html", ".htm"))
-    iteration, (splats, *_), trained = model_folder.open_model(config.model, crop=config.crop)
+    iteration, file, trained = model_folder.open_model(config.model, crop=config.crop)
     cameras = [*model_folder.read_refined(config.model, iteration).items()]
     cameras = cameras or model_folder.read_cameras(model_folder.folder_of(config.model))
-    kept = pack.shown(splats, config.max_gaussians)
+    kept = pack.shown(file.splats, config.max_gaussians)
+    up = UP if read_coordinates(model_folder.folder_of(config.model)) or file.coordinates else None
     options = {
         "ANTIALIASED": bool(trained.get("antialiasing")),
         "ELLIPSOID": trained.get("projection") == "ellipsoid",
@@ -52,9 +54,11 @@ def export_html(config: ExportHtmlConfig) -> int:
         "BACKGROUND": float(bool(trained.get("white_background"))),
     }
     behind, exposures = (read(config.model, iteration) for read in (model_folder.read_environment, read_exposures))
-    page = make_page(Path(config.model).resolve().name, kept, cameras or [("start", overview(kept.means)[0])], options)
+    page = make_page(
+        Path(config.model).resolve().name, kept, cameras or [("start", overview(kept.means)[0])], options, up
+    )
     write_text(path, page)
-    size, total = len(page) / 1e6, len(splats.means)
+    size, total = len(page) / 1e6, len(file.splats.means)
     print(f"{path}: {len(kept.means)} of {total} Gaussians, {len(cameras)} cameras, {size:.1f} MB; for any browser")
     if behind is not None:
         color = "white" if options["BACKGROUND"] else "black"
@@ -72,7 +76,13 @@ def export_html(config: ExportHtmlConfig) -> int:
     return 0
 
 
-def make_page(name: str, splats: SplatArrays, cameras: list[tuple[str, Camera]], options: dict[str, object]) -> str:
+def make_page(
+    name: str,
+    splats: SplatArrays,
+    cameras: list[tuple[str, Camera]],
+    options: dict[str, object],
+    up: np.ndarray | None = None,
+) -> str:
     """The page's text.
 
     Args:
@@ -81,6 +91,7 @@ def make_page(name: str, splats: SplatArrays, cameras: list[tuple[str, Camera]],
         cameras: names and cameras, at least one; the first is where the page starts.
         options: how to render: ANTIALIASED, ELLIPSOID, LINEAR (bool; the last: colors are in linear light), BACKGROUND
             (float: 0.0 black, 1.0 white).
+        up: [3], away from the ground; by default the mean of the cameras.
 
     Raises:
         InputError: if there are more Gaussians than browsers take.
@@ -109,7 +120,7 @@ def make_page(name: str, splats: SplatArrays, cameras: list[tuple[str, Camera]],
         "before": before,
         "near": constants.NEAR,
         "origin": origin.tolist(),
-        "up": mean_up([camera for _, camera in cameras]).tolist(),
+        "up": (mean_up([camera for _, camera in cameras]) if up is None else up).tolist(),
         "cameras": [{"name": name, **model_folder.camera_entry(camera)} for name, camera in cameras],
     }
     blocks = {file: _source(file) for file in (*SHADERS, "sort.js")}

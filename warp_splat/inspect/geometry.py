@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from warp_splat.camera import Camera
+from warp_splat.camera import Camera, mean_up
 from warp_splat.errors import InputError
+from warp_splat.formats.coordinates import UP, read_coordinates
 from warp_splat.inspect.subject import Finding, Subject
 from warp_splat.scene import gains as brightness
 from warp_splat.scene import horizon
@@ -92,7 +93,10 @@ def check_coverage(subject: Subject) -> Iterator[Finding]:
 def check_sky(subject: Subject) -> Iterator[Finding]:
     """How much of the photographs looks up to where there are no points."""
     if subject.photos and len(subject.points) and not subject.random_points:
-        share = horizon.share_of_sky([photo.camera for photo in subject.photos], subject.points)
+        cameras, known = [photo.camera for photo in subject.photos], None
+        with suppress(InputError):  # said elsewhere
+            known = read_coordinates(subject.source)
+        share = horizon.share_of_sky(cameras, subject.points, UP if known else mean_up(cameras))
         text = f"{100 * share:.1f} % of the photographs look up to where there are no points"
         needed = share >= horizon.NEEDED
         yield Finding("sky", "note" if needed else "ok", f"{text}{': train with --parts sky' * needed}.")

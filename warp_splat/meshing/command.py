@@ -129,7 +129,10 @@ def photographed(image: torch.Tensor, view: View, exposures: Exposures | None) -
     height, width, _ = image.shape
     pixels, camera = view.pixels, view.camera.resized(width, height)
     taken = image_at(torch.from_numpy(pixels.image).float(), camera, "area") / (1 if view.linear else 255)
-    more = taken - as_photographed(exposures, image, view.name)
+    shown = as_photographed(exposures, image, view.name)
+    if not view.linear:  # a photograph saturates
+        image, shown = image.clamp(0.0, 1.0), shown.clamp(0.0, 1.0)
+    more = taken - shown
     if pixels.mask is not None:
         more = more * image_at(torch.from_numpy(pixels.mask[..., None]), camera).bool()
     return image + more

@@ -78,11 +78,11 @@ def _draw(opened: Opened, before: SplatArrays, after: SplatArrays, path) -> None
     """A sheet of the views that changed most, before and after."""
     views = [*opened.scene.test, *opened.scene.train]
     pictures = [opened.picture_of(splats) for splats in (before, after)]
-    pairs = [[picture(view.camera, view.name) for picture in pictures] for view in views]
-    changes = [np.abs(one.astype(int) - other).mean() for one, other in pairs]
+    pair = lambda view: [picture(view.camera, view.name) for picture in pictures]  # noqa: E731 - memory holds few
+    changes = [np.abs(one.astype(int) - other).mean() for one, other in map(pair, views)]
     sections: dict[str, list] = {"before": [], "after": []}
     for index in np.argsort(changes, kind="stable")[::-1][:SHOWN]:
         view = views[index]
-        for rows, render in zip(sections.values(), pairs[index], strict=True):
+        for rows, render in zip(sections.values(), pair(view), strict=True):
             rows.append((view.name, view.picture, render, f"PSNR {psnr(render, view.picture, view.mask):.2f} dB"))
     contact_sheet(path, sections)

@@ -167,16 +167,16 @@ def _count(config: SimplifyConfig, output: Path, file: SplatFile, to: Callable[[
         fits = lambda count: written_bytes(output, file._replace(splats=to(count))) <= most  # noqa: E731
         if fits(total):
             return total
-        count = _narrowed(1, total, fits)[0] if fits(1) else 0
+        count = _narrowed(1, total, fits, total.bit_length() + TRIES)[0] if fits(1) else 0
     if not count:
         raise InputError(f"{config.model}: nothing would be left of {total} Gaussians; keep more, or allow more bytes.")
     return count
 
 
-def _narrowed(low: int, high: int, is_low: Callable[[int], bool]) -> tuple[int, int]:
+def _narrowed(low: int, high: int, is_low: Callable[[int], bool], tries: int = TRIES) -> tuple[int, int]:
     """Counts nearer to where ``is_low`` ends: it holds of the first of the two, and not of the second."""
-    for _ in range(TRIES):
-        if high - low < 2:
+    for _ in range(tries):
+        if high - low <= max(1, low >> TRIES):
             break
         middle = (low + high) // 2
         low, high = (middle, high) if is_low(middle) else (low, middle)

@@ -96,7 +96,7 @@ def tuned(
         begin(exposures)
     total = len(trainer.model)
     for number in range(1, steps + 1):
-        stage = math.ceil(number / max(1, THINNED * steps / STAGES))
+        stage = math.ceil(STAGES * number / max(1, THINNED * steps))
         wanted = max(count, round(total * (count / total) ** (min(stage, STAGES) / STAGES)))
         if wanted < len(trainer.model):
             nothing = {name: rows.detach()[:0] for name, rows in trainer.model.parameters.items()}

@@ -14,6 +14,7 @@ ORBIT_VIEW = (1.4, 0.9)  # horizontal and vertical field of view, rad
 ORBIT_RADIUS = 5.0  # world units from the world's origin
 HALF = 0.5 * np.array(ORBIT_SIZE)
 ORBIT_LENS = Camera(*ORBIT_SIZE, *(HALF / np.tan(0.5 * np.array(ORBIT_VIEW))), *HALF, np.eye(3), np.zeros(3))
+PARALLEL = 0.03  # squared sine: axes that cross at less do not say where
 TURNS = 2  # of a spiral
 LARGEST_SPIRAL = 0.3  # times the distance of what it looks at
 KEY_FRAMES = 10  # between two cameras that a path passes: fewer show how a hand shook
@@ -72,8 +73,9 @@ def focus_point(scene: Scene) -> tuple[np.ndarray, np.ndarray, float]:
     """The point nearest to all optical axes (least squares), the scene's up, the cameras' mean distance from it."""
     cameras = [view.camera for view in scene.train]
     across = [np.eye(3) - np.outer(camera.forward, camera.forward) for camera in cameras]
-    wanted = sum(a @ camera.center for a, camera in zip(across, cameras, strict=True))
-    center = np.linalg.lstsq(sum(across), wanted, rcond=None)[0]
+    middle = np.median(scene.points.astype(np.float64), axis=0)  # tells what axes that are nearly parallel do not
+    wanted = sum(a @ (camera.center - middle) for a, camera in zip(across, cameras, strict=True))
+    center = middle + np.linalg.lstsq(sum(across), wanted, rcond=PARALLEL)[0]
     return center, scene.up, float(np.mean([np.linalg.norm(camera.center - center) for camera in cameras]))
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from warp_splat.color import from_srgb
 from warp_splat.config import LENSES, NEAR
 from warp_splat.errors import InputError
+from warp_splat.formats.coordinates import read_coordinates
 from warp_splat.scene.photos import PHOTOS, ImageFinder, find_files, is_video, jpeg_hint, photo_root, sfm_hint
 from warp_splat.scene.types import Scene, View, nearest_shown, visible
 from warp_splat.text import Report
@@ -90,7 +91,8 @@ def load_scene(
         file, points, colors = load_start(start, report)
     elif drawn:
         points, colors = random_points([photo.camera for photo in train])
-    if part := block_of(block, points, [photo.camera for photo in train]) if block else None:
+    cameras = [photo.camera for photo in train]
+    if part := block_of(block, points, cameras, bool(read_coordinates(source))) if block else None:
         counts = len(train), len(points)
         shown = np.array([part.shown(photo.camera, points) for photo in (*train, *test)])
         own, part = shown[:, part.number], part._replace(empty=np.flatnonzero(~shown[: len(train)].any(0)).tolist())

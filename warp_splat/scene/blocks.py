@@ -60,7 +60,7 @@ def _within(cell: np.ndarray, points: np.ndarray) -> np.ndarray:
     return ((cell[0] <= points) & (points < cell[1])).all(1)
 
 
-def block_of(text: str, points: np.ndarray, cameras: Sequence[Camera]) -> Block:
+def block_of(text: str, points: np.ndarray, cameras: Sequence[Camera], level: bool = False) -> Block:
     """The block K of N that ``text`` "K/N" names, of a scene with ``points`` [P, 3]: the same on every machine.
 
     Raises:
@@ -69,7 +69,7 @@ def block_of(text: str, points: np.ndarray, cameras: Sequence[Camera]) -> Block:
     number, slash, count = (int(word) if word.isdecimal() else word for word in text.partition("/"))
     if not (slash and isinstance(number, int) and isinstance(count, int) and 1 <= number <= count):
         raise InputError(f"--block {text}: expected K/N, K from 1 to N, such as 2/4 for the second of four blocks.")
-    up = np.abs(sum(camera.rotation[1] for camera in cameras)).argmax()
+    up = 1 if level else np.abs(sum(camera.rotation[1] for camera in cameras)).argmax()  # of coordinates, or as shown
     ground = [axis for axis in range(3) if axis != up]
 
     def cut(points: np.ndarray, cell: np.ndarray, count: int) -> list[np.ndarray]:

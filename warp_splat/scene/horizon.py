@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from warp_splat.camera import Camera, mean_up
+from warp_splat.camera import Camera
 from warp_splat.scene.types import Scene, visible
 
 CELLS = 24  # along the longer side of a photograph
@@ -15,12 +15,11 @@ NEEDED = 0.015  # share from which on a sky is worth to learn; indoors plain wal
 VIEWS, POINTS = 60, 100_000  # that are looked at, at most
 
 
-def share_of_sky(cameras: Sequence[Camera], points: np.ndarray) -> float:
+def share_of_sky(cameras: Sequence[Camera], points: np.ndarray, up: np.ndarray) -> float:
     """The share of the photographs' cells that look up, and have no point [P, 3] in them, beside them or above them.
 
-    Up is where most cameras have it. A plain ceiling looks the same.
+    ``up`` [3]: away from the ground. A plain ceiling looks the same.
     """
-    up = mean_up(cameras)
     points = points[:: -(-len(points) // POINTS) or 1].astype(np.float64)
     return float(np.mean([_sky(camera, points, up).mean() for camera in cameras[:: -(-len(cameras) // VIEWS)]]))
 

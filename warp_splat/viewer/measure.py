@@ -25,7 +25,7 @@ def point_at(draw: Callable, camera: Camera, place: tuple[float, float]) -> np.n
         place: in the frame, 0..1 from the left and from the top.
     """
     pixel = np.array(place) * (camera.width, camera.height)
-    left, top = pixel - TILE / 2
+    left, top = pixel - (TILE + 1) / 2  # to the middle of its pixel TILE // 2
     near = replace(camera, width=TILE, height=TILE, cx=camera.cx - left, cy=camera.cy - top)
     depth = float(draw(near, median=True).median_depth[TILE // 2, TILE // 2])
     ray = camera.rays(pixel[None])[0]

@@ -38,7 +38,7 @@ class Sky:
             return Verdict(False, "the scene has no points, beside which a sky would show")
         if any(view.alpha is not None and (view.alpha < 255).any() for view in scene.train):
             return Verdict(False, "photographs are transparent somewhere, and have no sky there")
-        share = share_of_sky([view.camera for view in scene.train], scene.points)
+        share = share_of_sky([view.camera for view in scene.train], scene.points, scene.up)
         figure = f"{100 * share:.1f} % of the photographs look up to where there are no points"
         return Verdict(share >= NEEDED, f"{figure} (limit {100 * NEEDED} %)")
 
