@@ -11,11 +11,14 @@ from scene_files import LENS, texture, write_image
 
 from warp_splat.camera import Camera
 from warp_splat.cli import main
-from warp_splat.formats.checkpoint import LAST
+from warp_splat.formats.checkpoint import LAST, load_checkpoint
 from warp_splat.formats.coordinates import write_coordinates
 from warp_splat.formats.exchange import load_gaussians, save_gaussians
 from warp_splat.formats.model_folder import ply_path
 from warp_splat.formats.ply import save_points
+from warp_splat.formats.splats import SplatFile
+from warp_splat.gaussians import GaussianModel
+from warp_splat.rendering.finished import Finished
 from warp_splat.scene import load_scene
 from warp_splat.scene.blocks import BLOCK, block_of
 from warp_splat.training.options import TrainConfig
@@ -117,6 +120,21 @@ def test_a_block_half_trained_keeps_its_kind(tmp_path, monkeypatch, fails, name,
         assert main([*map(str, words)]) == 130
     more = ("--max_gaussians", 9000) * (name == "growth")
     assert f"--{name} {other}: expected {TrainConfig().flat()[name]}, as in" in fails(*words, f"--{name}", other, *more)
+
+
+def test_a_block_is_that_of_what_it_started_from(tmp_path, fails):
+    """Where its views are drawn, and where it goes on; not that of the scene's own points."""
+    random, folder = np.random.default_rng(0), tmp_path / "model"
+    means = np.concatenate([load_scene(SCENE, report=str).points[:40], random.normal((9, 0, 0), 0.1, (400, 3))])
+    splats = GaussianModel.from_points(means.astype(np.float32), np.zeros(means.shape, np.uint8), 0).splats()
+    save_gaussians(tmp_path / "start.ply", SplatFile(splats))
+    words = "--block", "1/2", "--start_ply", str(tmp_path / "start.ply"), "--iterations", "2", "--no-eval"
+    assert train(folder, *words) == 0
+    views = [view.name for view in Finished(folder).load_scene("", str).train]
+    assert views == load_checkpoint(folder).facts["views"]
+    (tmp_path / "start.ply").unlink()
+    refusal(lambda: Finished(folder).load_scene("", str), "expected what block 1/2 started from")
+    assert "start.ply" in fails("train", "--resume", folder, "--iterations", "4")
 
 
 def put(trained, folder, *numbers):

@@ -311,7 +311,9 @@ def test_a_model_of_other_cameras_is_refused(tmp_path, ran, fails):
     for command in (["render", "-m", model, "--quiet"], new, resumed):
         assert "name the scene that it was trained on" in fails(*command)
     beside = ply_path(model, 1).parent / "cameras.json"
-    beside.write_text(cameras.read_text())  # refined with the Gaussians, as far as was asked for
+    beside.write_text(cameras.read_text())  # refined with the Gaussians, but not from another place
+    assert "name the scene that it was trained on" in fails(*resumed)
+    write(1.2)  # as far as was asked for
     ran(*resumed, "-m", tmp_path / "refined")
     beside.unlink()
     axes = np.array([entry["rotation"] for entry in entries])  # columns, in the world

@@ -41,7 +41,8 @@ class TapeOutput:
     radii: wp.array  # [N] int, px from the mean to the farthest point where alpha >= alpha_min; 0 if culled
     invalid: int  # Gaussians left out because a quaternion was zero
     dropped: Dropped  # what the adjoint refused to spread
-    features: wp.array | None = None  # [H, W, C] float, if given; the others, if asked for: see warp_splat.RenderOutput
+    # if given or asked for: see warp_splat.RenderOutput, whose planes, bound and rounding are not among them
+    features: wp.array | None = None  # [H, W, C] float
     normals: wp.array | None = None  # [H, W] vec3
     median_depth: wp.array | None = None  # [H, W] float
     strongest: wp.array | None = None  # [H, W, k] int64

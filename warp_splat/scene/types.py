@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 WALK = 5.0  # times as far away as what comes near: the largest extent
 REFINED = 0.05  # of a scene's extent, and rad, together, by which a training moves and turns no camera
+ASKED_FOR = 0.5  # likewise, with --parts pose
 EVALUATED = 100  # views, at most, of those for training: hundreds more would take hours, and say the same
 
 
@@ -183,11 +184,12 @@ class Scene:
             )
         ends = lambda camera: camera.center + self.extent * camera.rotation  # noqa: E731 - of its axes, [3, 3]
         here, off = {view.name: ends(view.camera) for view in (*self.train, *self.test)}, []
-        refined = [*folder_of(name).glob(f"point_cloud/*/{CAMERAS}")]  # as far as was asked for
+        refined = any(folder_of(name).glob(f"point_cloud/*/{CAMERAS}"))
+        most = ASKED_FOR if refined else REFINED
         with suppress(InputError):  # another trainer's file may tell other things
             cameras = [(ends(camera), here[view]) for view, camera in read_cameras(folder_of(name)) if view in here]
             off = [np.linalg.norm(there - at, axis=1).max() for there, at in cameras]
-        if off and not refined and (far := np.quantile(off, 0.75) / self.extent) > REFINED:
+        if off and (far := np.quantile(off, 0.75) / self.extent) > most:
             raise InputError(
                 f"{name}: expected cameras as in {self.source}, found a quarter of them moved or turned by {far:.0%} "
                 "of its size; name the scene that it was trained on, or a copy of its .ply (-m, --start_ply)."

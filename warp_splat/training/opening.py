@@ -129,7 +129,8 @@ def open_scene(config: TrainConfig, begun: Checkpoint | None, say: Report, proce
     """Read the scene and tell what may surprise."""
     data = config.data
     say(f"Scene {data.source_path}")
-    start = data.start_ply if not begun or os.path.exists(data.start_ply) else ""  # if it has gone
+    needed = not begun or data.block  # whose cells it tells
+    start = data.start_ply if needed or os.path.exists(data.start_ply) else ""  # if it has gone
     same = {name: getattr(data, name) for name in OF_SCENE}
     memory = photo_memory(config.machine.photo_memory, processes)
     scene = load_scene(data.source_path, **same, start=start, memory=memory, report=say)
