@@ -243,6 +243,8 @@ def test_open_model(tmp_path, mark, monkeypatch, fails, ran):
     assert load_start(str(folder), print)[0].linear  # so that training can warn
     (folder / "coordinates.json").write_text("{")
     assert model_folder.open_model(folder, 3)[0] == 3 and "coordinates.json" in fails("convert", folder, target)
+    assert "coordinates.json" in fails("export-html", folder, tmp_path / "a.html")  # it says where up is
+    (folder / "coordinates.json").unlink()
     model_folder.write_cfg_args(folder, {"projection": "unscented"})
     assert "not by the unscented one" in ran("export-html", folder, tmp_path / "a.html")
     model_folder.write_cameras(folder, [], [view("1.jpg", 1)])
