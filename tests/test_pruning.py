@@ -248,11 +248,8 @@ def test_only_what_a_crop_leaves_is_compared(folder, tmp_path, ran, fails):
     assert "cover pixels of photographs" in fails(*arguments, "--crop", *(one - 1e-3), *(one + 1e-3))
 
 
-@pytest.mark.parametrize(
-    "command",
-    [pytest.param(["simplify", "--keep", "0.9"], marks=pytest.mark.slow), ["clean"]],
-    ids=lambda words: words[0],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("command", [["simplify", "--keep", "0.9"], ["clean"]], ids=lambda words: words[0])
 def test_what_a_file_has_no_room_for_counts(folder, tmp_path, ran, monkeypatch, fails, command):
     """What is said of a .splat is what is there, which has no harmonics, nor a mark of antialiasing."""
     monkeypatch.setattr("warp_splat.pruning.simplify.LEVELS", (1.0,))
@@ -288,6 +285,7 @@ def test_a_small_part_of_a_model_is_found():
     assert 2900 <= _narrowed(1, 4500, lambda count: tried.append(count) or count <= 3000)[0] <= 3000 and len(tried) <= 6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("steps", [1, 4])
 def test_a_few_steps_leave_as_many_as_asked_for(folder, tmp_path, ran, steps):
     ran("simplify", folder[0], "--keep", 0.5, "--steps", steps, "--device", "cpu", "-o", tmp_path / "a.ply")
