@@ -111,6 +111,17 @@ def test_axes_that_are_nearly_parallel_are_at_their_points(tilt):
     assert abs(center[1]) < 3 and np.abs(center).max() < 60 and 60 < distance < 400
 
 
+def test_axes_that_meet_say_where():
+    """Eight degrees aside, before a wall that has most points."""
+    cameras = []
+    for x, y in np.random.default_rng(0).uniform(-0.4, 0.4, (30, 2)):
+        turn = Rotation.align_vectors([[0.0, 0, 1]], [[-x, -y, 3.0]])[0].as_matrix()
+        cameras.append(replace(LENS, rotation=turn, translation=-turn @ (x, y, 0.0)))
+    points = np.random.default_rng(1).normal((0, 0, 10), 1, (900, 3)).astype(np.float32)
+    scene = replace(scene_of(cameras), points=points, colors=np.zeros((900, 3), np.uint8))
+    np.testing.assert_allclose(camera_paths.focus_point(scene)[0], (0, 0, 3), atol=1e-6)
+
+
 def circle(count, radius=3.0, turn=1.5 * np.pi):
     """Cameras on a part of a circle around the origin, looking at it from above."""
     angles = np.linspace(0, turn, count)

@@ -13,7 +13,7 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
-from commands import python
+from commands import PATIENCE, ROOT, SCENE, python
 
 import warp_splat
 from warp_splat.runtime import launch, pool
@@ -219,3 +219,20 @@ def test_threads_must_be_a_positive_number(count):
 def test_threads_may_be_a_whole_number_of_any_kind(threads):
     threads(np.int64(2))
     assert warp_splat.get_threads() == 2 and type(warp_splat.get_threads()) is int
+
+
+@pytest.mark.slow
+def test_a_terminal_that_is_closed_ends_a_training_as_ctrl_c_does(tmp_path):
+    """It writes all that it has, and finds nobody to tell."""
+    pty = pytest.importorskip("pty")
+    folder, end = tmp_path / "model", time.time() + PATIENCE
+    process, terminal = pty.fork()
+    if not process:
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)  # nohup has it ignored
+        options = ["-s", SCENE, "-r", "8", "-m", folder, "--iterations", "100000", "--test_iterations", "9", "--quiet"]
+        os.execv(sys.executable, [sys.executable, ROOT / "train.py", *map(str, options)])
+    while not (folder / "preview.png").exists() and time.time() < end:
+        time.sleep(0.1)
+    os.close(terminal)
+    assert os.waitstatus_to_exitcode(os.waitpid(process, 0)[1]) == 130
+    assert (folder / "results.json").exists() and list(folder.glob("point_cloud/*/*.ply"))

@@ -292,12 +292,14 @@ def test_a_few_steps_leave_as_many_as_asked_for(folder, tmp_path, ran, steps):
     assert len(load_gaussians(tmp_path / "a.ply").splats.means) == round(0.5 * len(folder[1].means))
 
 
-@pytest.mark.parametrize("there", [True, False])
-def test_maps_of_depth_are_those_of_the_training(tmp_path, there):
+@pytest.mark.parametrize(("name", "there"), [("", True), ("maps", True), ("gone", False)])
+def test_maps_of_depth_are_those_of_the_training(tmp_path, name, there):
     """A scene without tracks has no other depths; without the folder, those of tracks are left."""
-    trained = {"parts": "depth,pose", "depths": str(tmp_path / "" if there else tmp_path / "gone")}
-    config = _config(SplatFile(some_splats(3)), 5, 0, trained, torch.device("cpu"))
-    assert config.model.parts == "depth" and config.flat()["depths"] == (str(tmp_path) if there else "")
+    (tmp_path / "maps").mkdir()  # in the scene, or a path
+    depths, scene = name or str(tmp_path), SimpleNamespace(source=tmp_path)
+    trained = {"parts": "depth,pose", "depths": depths}
+    config = _config(scene, SplatFile(some_splats(3)), 5, 0, trained, torch.device("cpu"))
+    assert config.model.parts == "depth" and config.flat()["depths"] == depths * there
 
 
 @pytest.mark.long

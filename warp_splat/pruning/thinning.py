@@ -90,7 +90,8 @@ def tuned(
         exposures: that it found.
     """
     degree = COEFFICIENTS.index(file.splats.sh.shape[1])
-    trainer = Trainer(replace(scene, start=file), _config(file, steps, degree, trained, setting.background.device))
+    config = _config(scene, file, steps, degree, trained, setting.background.device)
+    trainer = Trainer(replace(scene, start=file), config)
     trainer.background = setting.background
     for begin in having(trainer.parts, "begin") if exposures else ():
         begin(exposures)
@@ -107,11 +108,12 @@ def tuned(
     return trainer.model.splats()
 
 
-def _config(file: SplatFile, steps: int, degree: int, trained: dict, device: torch.device) -> TrainConfig:
+def _config(scene: Scene, file: SplatFile, steps: int, degree: int, trained: dict, device: torch.device) -> TrainConfig:
     """Options of a training that neither grows nor resets, at all degrees from its first step on."""
     known = {item.name: item for item in flags_of(TrainConfig) if item.name in SAME}
     same = {name: trained[name] for name, item in known.items() if name in trained and fits(trained[name], item)}
-    same["depths"] = depths if os.path.isdir(depths := str(same.get("depths", ""))) else ""
+    if not os.path.isdir(os.path.join(scene.source or "", str(same.get("depths", "")))):
+        same["depths"] = ""
     same["parts"] = ",".join(name for name in same.get("parts", "").split(",") if name in {*PARTS} - LEARNED)
     return TrainConfig(
         **RATES,

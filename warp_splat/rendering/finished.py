@@ -114,13 +114,11 @@ class Finished:
             raise InputError(f"{self.path}: expected a whole number as resolution in cfg_args, found {resolution!r}.")
         flags = {name: bool(trained.get(name)) for name in ("white_background", "eval", "invert_masks")}
         names = {"images": str(trained.get("images", "images")), "lens": str(trained.get("lens", "undistort"))}
-        if block := str(trained.get("block") or ""):  # its cells are those of what it started from
-            start = str(trained.get("start_ply") or "")
-            if start and not os.path.exists(start):
-                raise InputError(
-                    f"{start}: expected what block {block} started from, which tells its views; put it back."
-                )
-            names |= {"block": block, "start": start}
+        names["block"], start = str(trained.get("block") or ""), str(trained.get("start_ply") or "")
+        if names["block"] and start:  # its cells are those of what it started from
+            names["start"] = start if os.path.exists(start) else ""
+            if not names["start"]:
+                say(f"Warning: {start}, which the block started from, has gone; it may have had other photographs.")
         scene = load_scene(source, **names, resolution=resolution, **flags, memory=photo_memory(), report=say)
         scene.refuse_other_frame(self.path, self.placed().coordinates)
         return scene

@@ -2,10 +2,13 @@
 
 import os
 import signal
+import stat
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
-from typing import NoReturn
+from typing import Any, NoReturn
+
+HANGUP = getattr(signal, "SIGHUP", None)  # not on Windows
 
 
 @contextmanager
@@ -14,7 +17,16 @@ def _handling(numbers: Sequence[int], handler: Callable) -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    previous = {number: signal.signal(number, handler) for number in numbers}
+
+    def handle(number: int, frame: Any) -> None:
+        if number == HANGUP:  # what is said from here on goes nowhere: a terminal that is closed refuses it
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            for stream in (1, 2):
+                if stat.S_ISCHR(os.fstat(stream).st_mode):
+                    os.dup2(nowhere, stream)
+        handler(number, frame)
+
+    previous = {number: signal.signal(number, handle) for number in numbers}
     try:
         yield
     finally:
@@ -24,8 +36,7 @@ def _handling(numbers: Sequence[int], handler: Callable) -> Iterator[None]:
 
 def _ending() -> list[int]:
     """What ends a process by default: SIGTERM, and SIGHUP of a terminal that is closed, unless nohup has it ignored."""
-    there = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]  # Windows has no SIGHUP
-    return [number for number in there if signal.getsignal(number) != signal.SIG_IGN]
+    return [number for number in (signal.SIGTERM, HANGUP) if number and signal.getsignal(number) != signal.SIG_IGN]
 
 
 @contextmanager
