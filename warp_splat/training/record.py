@@ -192,8 +192,8 @@ def finish(trainer: Trainer, run: Run, say: Report) -> None:
         "peak_memory_mb": peak_memory(),
         "dropped": run.dropped,
     }
-    there = run.saved.is_relative_to(run.folder)  # else the next run has to save it again
-    if trainer.scene.block and there and run.iteration >= trainer.config.learn.end:
+    # else the next run has to save it again
+    if trainer.scene.block and run.iteration >= trainer.config.learn.end and run.saved.is_relative_to(run.folder):
         write_block(run.folder, trainer.scene.block)
     metrics, absent = choose_metrics(trainer.config.report.lpips_weights)
     for sentence in absent:

@@ -51,9 +51,10 @@ class Exposure:
 
     @torch.no_grad()
     def begin(self, found: Exposures) -> None:
-        """Take what a training of the same kind found of these photographs, and leave it so."""
-        if found.kind == self.kind and all(view.name in found.maps for view in self.places):
-            self.maps.copy_(torch.from_numpy(np.stack([found.maps[view.name] for view in self.places])))
+        """Take what a training of the same kind found, and leave it so: of photographs that it did not see, nothing."""
+        if found.kind == self.kind:
+            maps = [found.maps.get(view.name, np.zeros(self.maps.shape[1:], np.float32)) for view in self.places]
+            self.maps.copy_(torch.from_numpy(np.stack(maps)))
             self.falloff.copy_(torch.from_numpy(found.falloff))
             for table in (self.maps, self.falloff):
                 table.requires_grad_(False)
