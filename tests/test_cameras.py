@@ -120,6 +120,8 @@ def test_axes_that_meet_say_where():
     points = np.random.default_rng(1).normal((0, 0, 10), 1, (900, 3)).astype(np.float32)
     scene = replace(scene_of(cameras), points=points, colors=np.zeros((900, 3), np.uint8))
     np.testing.assert_allclose(camera_paths.focus_point(scene)[0], (0, 0, 3), atol=1e-6)
+    scene = replace(scene, points=points[:0], colors=np.zeros((0, 3), np.uint8))
+    np.testing.assert_allclose(camera_paths.focus_point(scene)[0], (0, 0, 3), atol=1e-6)
 
 
 def circle(count, radius=3.0, turn=1.5 * np.pi):

@@ -4,6 +4,7 @@ import gc
 import itertools
 import os
 import signal
+import subprocess
 import sys
 import threading
 import time
@@ -13,7 +14,7 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
-from commands import PATIENCE, ROOT, SCENE, python
+from commands import PATIENCE, ROOT, SCENE, environment_of, python
 
 import warp_splat
 from warp_splat.runtime import launch, pool
@@ -236,3 +237,23 @@ def test_a_terminal_that_is_closed_ends_a_training_as_ctrl_c_does(tmp_path):
     os.close(terminal)
     assert os.waitstatus_to_exitcode(os.waitpid(process, 0)[1]) == 130
     assert (folder / "results.json").exists() and list(folder.glob("point_cloud/*/*.ply"))
+
+
+HANGS_UP = """
+import os, signal
+from warp_splat.runtime.interrupts import interruptible
+signal.signal(signal.SIGHUP, signal.SIG_DFL)
+with interruptible() as found:
+    os.kill(os.getpid(), signal.SIGHUP)
+os._exit(0 if found else 3)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "words", [["-m", "warp_splat", "inspect", str(SCENE)], ["-c", HANGS_UP]], ids=["inspect", "signal"]
+)
+def test_nothing_is_said_where_streams_are_closed(words):
+    pytest.importorskip("pty")
+    command = ["sh", "-c", 'exec "$@" >&- 2>&-', "sh", sys.executable, *words]
+    assert subprocess.run(command, check=False, cwd=ROOT, env=environment_of()).returncode == 0

@@ -202,6 +202,8 @@ def _check_minutes(given: dict) -> None:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run a command; returns the exit code: 0, 1 for bad input, 130 for an interruption."""
+    # Python has none for those that are closed
+    sys.stdout, sys.stderr = (stream or open(os.devnull, "w") for stream in (sys.stdout, sys.stderr))
     alike = os.environ.get("LOCAL_RANK", "0") != "0"  # what another process of this machine says as well
     if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":  # a name that it lacks ends nothing
         sys.stdout.reconfigure(errors="backslashreplace")

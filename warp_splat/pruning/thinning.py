@@ -70,13 +70,7 @@ def _costliest(model: GaussianModel, setting: ViewSetting, count: int) -> torch.
 
 
 def tuned(
-    scene: Scene,
-    file: SplatFile,
-    setting: ViewSetting,
-    count: int,
-    steps: int,
-    trained: dict,
-    exposures: Exposures | None,
+    scene: Scene, file: SplatFile, setting: ViewSetting, count: int, steps: int, trained: dict, found: Exposures | None
 ) -> SplatArrays:
     """The model in ``count`` Gaussians, which ``steps`` of training adapt; they are left out by and by.
 
@@ -87,14 +81,14 @@ def tuned(
         count: of Gaussians to keep.
         steps: of training.
         trained: options of the model's training.
-        exposures: that it found.
+        found: exposures that it found.
     """
     degree = COEFFICIENTS.index(file.splats.sh.shape[1])
     config = _config(scene, file, steps, degree, trained, setting.background.device)
     trainer = Trainer(replace(scene, start=file), config)
     trainer.background = setting.background
-    for begin in having(trainer.parts, "begin") if exposures else ():
-        begin(exposures)
+    for begin in having(trainer.parts, "begin") if found else ():
+        begin(found)
     total = len(trainer.model)
     for number in range(1, steps + 1):
         stage = math.ceil(STAGES * number / max(1, THINNED * steps))

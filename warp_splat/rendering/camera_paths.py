@@ -73,7 +73,8 @@ def focus_point(scene: Scene) -> tuple[np.ndarray, np.ndarray, float]:
     """The point nearest to all optical axes (least squares), the scene's up, the cameras' mean distance from it."""
     cameras = [view.camera for view in scene.train]
     across = [np.eye(3) - np.outer(camera.forward, camera.forward) for camera in cameras]
-    middle = np.median(scene.points.astype(np.float64), axis=0)  # tells what axes that are nearly parallel do not
+    # tells what axes that are nearly parallel do not
+    middle = np.median(scene.points.astype(np.float64), axis=0) if len(scene.points) else np.zeros(3)
     wanted = sum(a @ (camera.center - middle) for a, camera in zip(across, cameras, strict=True))
     center = middle + np.linalg.lstsq(sum(across), wanted, rcond=PARALLEL)[0]
     return center, scene.up, float(np.mean([np.linalg.norm(camera.center - center) for camera in cameras]))

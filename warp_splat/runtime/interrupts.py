@@ -5,7 +5,7 @@ import signal
 import stat
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, suppress
 from typing import Any, NoReturn
 
 HANGUP = getattr(signal, "SIGHUP", None)  # not on Windows
@@ -22,8 +22,9 @@ def _handling(numbers: Sequence[int], handler: Callable) -> Iterator[None]:
         if number == HANGUP:  # what is said from here on goes nowhere: a terminal that is closed refuses it
             nowhere = os.open(os.devnull, os.O_WRONLY)
             for stream in (1, 2):
-                if stat.S_ISCHR(os.fstat(stream).st_mode):
-                    os.dup2(nowhere, stream)
+                with suppress(OSError):  # it is closed
+                    if stat.S_ISCHR(os.fstat(stream).st_mode):
+                        os.dup2(nowhere, stream)
         handler(number, frame)
 
     previous = {number: signal.signal(number, handle) for number in numbers}
