@@ -90,7 +90,8 @@ class Blends:
 
     def upstream(self, slots: torch.Tensor) -> None:
         states = (self.background, self.saved)
-        found = CUDA.spread_upstream(self.bins, self.options, *states, self.adj_pixels, slots)
+        found, before = CUDA.spread_upstream(self.bins, self.options, *states, self.adj_pixels, slots)
+        CUDA.launch_tiles(self.bins, before)
         (self.up, self.adj_final), _, _, self.steps = found
 
     def reverse(self, kernel: wp.Kernel, rows: torch.Tensor) -> None:

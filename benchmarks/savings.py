@@ -109,9 +109,8 @@ def every_block(_: Trainer) -> AbstractContextManager:
 def whole_lists(_: Trainer) -> AbstractContextManager:
     """The adjoint from the end of each tile's list, not from where its last pixel stopped."""
 
-    def differentiate(mode, bins: Bins, chosen, saved, upstream, steps: torch.Tensor, slots) -> None:
-        steps.copy_(bins.ranges[:, 1] - bins.ranges[:, 0])
-        original(mode, bins, chosen, saved, upstream, steps, slots)
+    def differentiate(mode, bins: Bins, chosen, saved, upstream, steps, slots, before) -> None:
+        original(mode, bins, chosen, saved, upstream, bins.ranges[:, 1] - bins.ranges[:, 0], slots, before)
 
     original = CPU.differentiate
     return patch.object(CPU, "differentiate", differentiate)

@@ -82,13 +82,8 @@ def timed(clock: Clock, run: Callable[[], None]) -> Callable[[], None]:
 def measure(step: Callable[[], None], threads: int) -> tuple[dict[str, float], dict[str, float]]:
     """Seconds of each stage and of the whole step, and of those in which no work was shared; means over VIEWS steps."""
     clock, job = Clock(), pool._Job
-
-    def job_of(slices: list) -> pool._Job:
-        """What ``pool.at_once`` runs is on one thread, however many there are, unless it shares that work in turn."""
-        return job(slices if "at_once" in slices[0].func.__qualname__ else [timed(clock, run) for run in slices])
-
     pool.set_threads(threads)
-    timers._seconds, pool._Job = clock, job_of
+    timers._seconds, pool._Job = clock, lambda slices: job([timed(clock, run) for run in slices])
     whole = busy = 0.0
     try:
         for _ in range(VIEWS):

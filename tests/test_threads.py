@@ -150,13 +150,13 @@ def test_who_gets_no_more_threads_does_with_those_there_are(threads, monkeypatch
     assert sorted(done) == sorted([*range(5)] * 2) and not pool._helpers
 
 
-def test_calls_at_once_share_their_own_work(threads):
+def test_slices_share_their_own_work(threads):
     done = []
 
-    def share(first: int) -> None:
+    def share(first: int, _last: int) -> None:
         pool.in_slices(lambda low, high: done.extend(range(low, high)), [first, first + 2, first + 5])
 
-    pool.at_once(lambda: share(0), lambda: share(5), lambda: share(10))
+    pool.in_slices(share, [0, 5, 10, 15])
     assert sorted(done) == [*range(15)]
 
 

@@ -105,7 +105,7 @@ def _launch(blending: Blending, pixels: torch.Tensor, group: Group, strongest: t
     at_most = ranks.shape[2] if strongest else None
     kernel = blending.driver.kernels.channels.make_beside(variant_of(blending.options), at_most)
     inputs = [*blending.view_lists(), blending.saved.count, blending.steps, group.rows, group.begin, group.count]
-    blending.driver.launch_tiles(kernel, blending.bins, inputs, [pixels, ranks, median])
+    blending.driver.launch_tiles(blending.bins, (kernel, inputs, [pixels, ranks, median]))
 
 
 def _gaussians_of(bins: Bins, camera: Camera, ranks: torch.Tensor) -> torch.Tensor:
@@ -232,7 +232,7 @@ def _differentiate(
     kernel = driver.kernels.channels.make_adj_channels(mode, variant_of(options), most)
     ranks = slots.new_empty(0, 0, 0) if ranks is None else ranks.float()
     inputs = [*blending.view_lists(), *blending.saved[:2], blending.steps]
-    driver.launch_tiles(kernel, bins, [*inputs, group.rows, ranks, group.begin, group.count, adj_pixels], [slots])
+    driver.launch_tiles(bins, (kernel, [*inputs, group.rows, ranks, group.begin, group.count, adj_pixels], [slots]))
     tables = [slots.new_empty(bins.gaussian_count, size) for size in (2, 3, 1, width) if size]
     return driver.gather(bins, slots, tables)[:3], tables[-1][:, : group.count]
 

@@ -16,7 +16,7 @@ from warp_splat.kernels.simd import LANES
 from warp_splat.kernels.splat import Splat2D
 from warp_splat.raster.data import LESS, MAX_INSTANCES, Bins, Room, Splats2D, falloff_of
 from warp_splat.runtime.launch import bind, check_memory, empty, launch, read_later, send
-from warp_splat.runtime.pool import at_once, even_slices, falling_shares, in_slices, slice_count, torch_slices
+from warp_splat.runtime.pool import even_slices, falling_shares, falling_slices, in_slices, slice_count, torch_slices
 
 MANY = 10**7  # instances from which on their memory is asked for
 BYTES = 64  # of an instance: its place and blocks, what sorting it takes, and its row of gradients
@@ -56,18 +56,16 @@ def bin_by_counting(
     (order,) = orders
     row_ends, begins, row_count = _sums(_taken(rows, order))
     check_count(row_count, camera, count, splats2d.radii.device)
-    begins = _put(begins, order)
     spans, counts = empty(row_count, wp.vec2i, "cpu"), np.empty(count, dtype=np.int64)
-    inputs = [splats, rows, begins, camera.width, camera.height, tiles_x, square]
-    launch(lists.find_spans, groups, inputs, [spans, counts], bounds=even_slices(groups, each=LANES))
+    inputs = [splats, rows, _put(begins, order), camera.width, camera.height, tiles_x, square]
+    launch(lists.find_spans, groups, inputs, [spans, counts], bounds=falling_slices(groups, LANES))
     pictures = max(len(worlds), 1)
     if worlds:
         first = _first_tiles(worlds, tiles_x * tiles_y, splats2d.radii.device)[drawn[order]]
         wp.to_torch(spans)[:, 0] += torch.repeat_interleave(first, torch.from_numpy(_taken(rows, order)))
     bands = [0, *np.searchsorted(row_ends, even_slices(row_count)[1:-1]).tolist(), count]  # of as many rows each
-    (cursor, ends), (_, begins, total) = at_once(
-        lambda: _count_bands(bands, row_ends, spans, tiles_x * tiles_y * pictures), lambda: _sums(counts)
-    )
+    cursor, ends = _count_bands(bands, row_ends, spans, tiles_x * tiles_y * pictures)
+    _, begins, total = _sums(counts)
     check_count(total, camera, count, splats2d.radii.device)
     _check_longest(int(np.diff(ends, prepend=0).max(initial=0)))
     instances, places = (torch.empty(total, dtype=torch.int32, device="cpu") for _ in range(2))
@@ -171,8 +169,9 @@ def _count_bands(bounds: list[int], row_ends: np.ndarray, spans: wp.array, tiles
 
 def _sums(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
     """Where each of the counted ends, in 64 bits, because 32 wrap without a word, and begins, in 32; and their sum."""
-    ends = torch.cumsum(torch.from_numpy(counts), 0, dtype=torch.int64).numpy()  # in a quarter of numpy's time
-    return ends, (ends - counts).astype(np.int32), int(ends[-1]) if len(ends) else 0
+    ends = np.zeros(len(counts) + 1, dtype=np.int64)
+    torch.cumsum(torch.from_numpy(counts), 0, out=torch.from_numpy(ends[1:]))  # in a quarter of numpy's time
+    return ends[1:], ends[:-1].astype(np.int32), int(ends[-1])
 
 
 def _taken(values: np.ndarray, indices: np.ndarray) -> np.ndarray:

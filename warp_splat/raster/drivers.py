@@ -25,7 +25,8 @@ from warp_splat.kernels.structs import BinsView
 from warp_splat.kernels.tiles import count_in_front
 from warp_splat.raster import bin
 from warp_splat.raster.data import Bins, Pixels, Saved, alphas_of, limits_of, variant_of
-from warp_splat.runtime.launch import check_memory, empty, launch, launch_blocks, load, pack_struct
+from warp_splat.runtime.launch import bind, check_memory, empty, launch, launch_blocks, load, pack_struct
+from warp_splat.runtime.pool import falling_slices, slice_by_slice
 
 THREADS = TILE * TILE
 
@@ -38,7 +39,7 @@ class Driver:
     peeks: bool  # whether to look at a result between two kernels: on a GPU the host would have to wait for it
     bin: Callable[..., Bins]
     gather: Callable[..., list[torch.Tensor]]
-    launch_tiles: Callable[..., None]  # a kernel for each tile: kernel, bins, inputs, outputs
+    launch_tiles: Callable[..., None]  # on those of bins: a kernel, inputs, outputs, maybe its adjoint's; and the next
     kernels: ModuleType  # the package of those that take a tile: modules and makers have the same names in both
     shape: tuple[int, ...]  # of a number for each pixel of a tile, as its kernels have it
     counts: torch.dtype  # of a number of instances there
@@ -69,7 +70,7 @@ class Driver:
         variant = variant_of(options, keep, options.bound, options.hidden_from is not None)
         inputs = [bins.view(blocks=blocks), alphas_of(options), *limits_of(options), background, bins.bound, limits]
         outputs = [pixels.view(), final, count, saved.kept]
-        self.launch_tiles(self.kernels.blend.make_blend(variant), bins, inputs, outputs)
+        self.launch_tiles(bins, (self.kernels.blend.make_blend(variant), inputs, outputs))
         return pixels, saved
 
     def adjoint(
@@ -86,8 +87,9 @@ class Driver:
             adj_pixels: upstream gradients; dense.
         """
         slots = background.new_empty(len(bins.instances), variant_of(options).columns)  # a row per tile instance
-        up, adj_background, dropped, steps = self.spread_upstream(bins, options, background, saved, adj_pixels, slots)
-        self.differentiate(mode, bins, options, saved, up, steps, slots)
+        found, before = self.spread_upstream(bins, options, background, saved, adj_pixels, slots)
+        up, adj_background, dropped, steps = found
+        self.differentiate(mode, bins, options, saved, up, steps, slots, before)
         if self.peeks:  # numpy's sum is one after another, whatever the number of torch's threads
             return slots, torch.from_numpy(adj_background.numpy().sum(0)), dropped
         return slots, adj_background.sum(0), dropped
@@ -95,7 +97,7 @@ class Driver:
     def spread_upstream(
         self, bins: Bins, options: RasterOptions, background, saved: Saved, adj_pixels: Pixels, slots: torch.Tensor
     ) -> tuple:
-        """(Upstream gradients by pixel, dL/dT behind), dL/dbackground, dropped and steps of each tile.
+        """(Upstream gradients by pixel, dL/dT behind), dL/dbackground, dropped and steps of each tile; what finds them.
 
         Zeros in ``slots``, for the instances that the adjoint does not walk.
         """
@@ -106,17 +108,17 @@ class Driver:
         dropped, steps = (new(tile_count, dtype=torch.int32) for _ in range(2))
         inputs = [bins.view(), background, saved.final, saved.count, adj_pixels.view()]
         outputs = [up, adj_final, adj_background, dropped, steps, slots]
-        self.launch_tiles(self.kernels.adjoint.make_upstream(variant), bins, inputs, outputs)
-        return (up, adj_final), adj_background, dropped, steps
+        found = (up, adj_final), adj_background, dropped, steps
+        return found, (self.kernels.adjoint.make_upstream(variant), inputs, outputs)
 
     def differentiate(
-        self, mode: str, bins: Bins, options: RasterOptions, saved: Saved, upstream, steps, slots: torch.Tensor
+        self, mode: str, bins: Bins, options: RasterOptions, saved: Saved, upstream, steps, slots: torch.Tensor, before
     ) -> None:
-        """Fill ``slots`` [M, 9 or 10]; ``upstream`` and ``steps`` [T] are those of :meth:`spread_upstream`."""
+        """Fill ``slots`` [M, 9 or 10]; ``upstream`` and ``steps`` [T] are those that ``before`` finds."""
         lists, variant = bins.view(blocks=saved.blocks), variant_of(options)
         if mode in ("manual", "stepwise"):
             inputs = [lists, alphas_of(options), saved.final, saved.count, steps, *upstream]
-            self.launch_tiles(self.kernels.adjoint.make_reverse(mode, variant), bins, inputs, [slots])
+            self.launch_tiles(bins, before, (self.kernels.adjoint.make_reverse(mode, variant), inputs, [slots]))
             return
         inputs = [alphas_of(options), saved.final, saved.count, saved.kept, steps, slots]
         if mode == "generated":
@@ -126,7 +128,8 @@ class Driver:
             lists.splats = copies
         # ``upstream`` is what the kernel would write: its adjoint reads the gradients of that and writes ``slots``
         adjoint = {"adj_inputs": [BinsView(), *[None] * len(inputs)], "adj_outputs": upstream}
-        self.launch_tiles(self.kernels.taped.make_walk(mode, variant), bins, [lists, *inputs], upstream, **adjoint)
+        walk = self.kernels.taped.make_walk(mode, variant)
+        self.launch_tiles(bins, before, (walk, [lists, *inputs], upstream, adjoint))
         if mode == "generated":
             launch(cpu.taped.rows_of_copies, len(bins.instances), [lists.splats, lists.splats.grad], [slots])
 
@@ -143,12 +146,15 @@ def _room_for_states(bins: Bins) -> torch.Tensor:
     return torch.empty(count, TILE * TILE, dtype=torch.float32, device=device)
 
 
-def _launch_slices(kernel: wp.Kernel, bins: Bins, inputs: list, outputs: list, **adjoint) -> None:
-    launch(kernel, len(bins.ranges), inputs, outputs, bounds=bins.slices, **adjoint)
+def _launch_slices(bins: Bins, *launches: tuple) -> None:
+    """Each kernel on a slice of the tiles, then on the next: threads wait for each other once."""
+    passes = [bind(kernel, inputs, outputs, "cpu", **dict(*more)) for kernel, inputs, outputs, *more in launches]
+    slice_by_slice(passes, bins.slices)
 
 
-def _launch_blocks(kernel: wp.Kernel, bins: Bins, inputs: list, outputs: list, **adjoint) -> None:
-    launch_blocks(kernel, len(bins.ranges), inputs, outputs, bins.instances.device, **adjoint)
+def _launch_blocks(bins: Bins, *launches: tuple) -> None:
+    for kernel, inputs, outputs, *more in launches:
+        launch_blocks(kernel, len(bins.ranges), inputs, outputs, bins.instances.device, **dict(*more))
 
 
 def gather_by_splat(bins: Bins, slots: torch.Tensor, grads: list[torch.Tensor] | None = None) -> list[torch.Tensor]:
@@ -166,7 +172,8 @@ def gather_by_splat(bins: Bins, slots: torch.Tensor, grads: list[torch.Tensor] |
     addresses, widths = np.array(columns, np.int64), tuple(grad.shape[1] for grad in grads)
     kernel = cpu.gather.make_gather(widths if sum(widths) == width else widths[:-1])
     inputs = [bins.gaussian_count, bins.gaussians, bins.place_begins, bins.places, slots, 0.0]
-    launch(kernel, len(bins.place_begins) + 1, inputs, [addresses])
+    count = len(bins.place_begins) + 1
+    launch(kernel, count, inputs, [addresses], bounds=falling_slices(count))
     return [grad.squeeze(1) for grad in grads]
 
 

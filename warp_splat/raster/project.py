@@ -29,7 +29,7 @@ from warp_splat.raster.camera_parameters import CameraParameters
 from warp_splat.raster.data import Dropped, Gaussians, Splats2D, falloff_of, plus
 from warp_splat.raster.drivers import Driver, driver_of
 from warp_splat.runtime.launch import bind, filled_up, grouped, launch, pack_struct
-from warp_splat.runtime.pool import even_slices, in_slices
+from warp_splat.runtime.pool import even_slices, slice_by_slice
 from warp_splat.runtime.timers import stage
 
 Tensors = Sequence[torch.Tensor]
@@ -45,8 +45,8 @@ def camera_view(camera: Camera, rest: int, options: RasterOptions, limits: Camer
     size = np.array([camera.width, camera.height])
     cam = CameraView()
     cam.rotation = wp.mat33(*camera.rotation.ravel())
-    center = camera.center.astype(np.float32)
-    cam.center, cam.center_low = wp.vec3(*center), wp.vec3(*(camera.center - center))
+    center = (exact := camera.center).astype(np.float32)
+    cam.center, cam.center_low = wp.vec3(*center), wp.vec3(*(exact - center))
     cam.focal, cam.principal, cam.size = wp.vec2(camera.fx, camera.fy), wp.vec2(camera.cx, camera.cy), wp.vec2(*size)
     focal, principal = np.array([limits.fx, limits.fy]), np.array([limits.cx, limits.cy])
     margin = FRUSTUM_MARGIN * 0.5 * size / focal
@@ -187,16 +187,6 @@ def _harmonics(sh_dc: torch.Tensor, sh_rest: torch.Tensor) -> HarmonicsView:
     return pack_struct(HarmonicsView, **dict(zip(HarmonicsView.vars, (sh_dc[:, 0], *degrees), strict=True)))
 
 
-def _in_turn(passes: Sequence[Pass], count: int, lanes: int, device: torch.device) -> None:
-    """Go through the groups of ``count`` Gaussians by one pass after the other, slice by slice."""
-
-    def run(low: int, high: int) -> None:
-        for each in passes:
-            each(low, high)
-
-    in_slices(run, even_slices(-(-count // lanes), each=lanes, device=device))
-
-
 class Project(torch.autograd.Function):
     """3D to 2D: geometry, whose adjoint Warp generates, and colors."""
 
@@ -213,7 +203,8 @@ class Project(torch.autograd.Function):
         given = [it.cam, gaussians.means, _harmonics(gaussians.sh_dc, gaussians.sh_rest)]
         shade = bind(make_shade(lanes), given, [splats.view()], means.device)
         unseen: Pass = lambda low, high: splats.radii[lanes * low : lanes * high].fill_(int(UNSEEN))  # noqa: E731
-        _in_turn([_clear(splats[:-1], lanes), unseen, geometry, shade], count, lanes, means.device)
+        groups = even_slices(-(-count // lanes), each=lanes, device=means.device)
+        slice_by_slice([_clear(splats[:-1], lanes), unseen, geometry, shade], groups)
         ctx.save_for_backward(*gaussians, *splats, *learned)
         ctx.it = it
         ctx.mark_non_differentiable(splats.extents, splats.radii)
@@ -258,7 +249,8 @@ class Project(torch.autograd.Function):
                 if it.driver.peeks:
                     totals.extend(float(tensor[rows].sum()) for tensor in adj[:5])
 
-            _in_turn([shade, _clear(shapes, lanes), geometry, total], count, lanes, device)
+            groups = even_slices(-(-count // lanes), each=lanes, device=device)
+            slice_by_slice([shade, _clear(shapes, lanes), geometry, total], groups)
             adj_twist = adj_intrinsics = adj_last = adj_coefficients = None
             peeks = it.driver.peeks or it.camera.shutter is not None  # whose motion the host has looked at
             adj_motion = cameras.motion_gradient(None if it.bend else shared, lanes, wants_pose or wants_intrinsics)

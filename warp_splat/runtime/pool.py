@@ -5,11 +5,10 @@ import itertools
 import os
 import queue
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import partial
 from numbers import Integral
-from typing import Any
 
 import numpy as np
 import torch
@@ -20,7 +19,7 @@ from warp_splat.errors import InputError
 MOST_THREADS = 1024
 SMALLEST_SLICE = 4096  # indices, or tile instances; below, starting a thread costs more than it saves
 SMALLEST_OF_TORCH = 2**16  # likewise, of rows for torch, which takes less time and more of the interpreter's lock
-PER_THREAD = 5  # slices of work that is uneven
+PER_THREAD = 8  # slices of work that is uneven
 WIDTH = 64  # numbers: a multiple of what torch computes at once on any processor
 
 _threads = CORES
@@ -160,6 +159,11 @@ def falling_shares(work: int) -> np.ndarray:
     return 1.0 - (np.arange(parts, -1, -1) / parts) ** power
 
 
+def falling_slices(dim: int, each: int = 1) -> list[int]:
+    """Bounds of :func:`falling_shares` of ``dim`` pieces of work, of ``each`` indices."""
+    return [int(dim * share) for share in falling_shares(dim * each)]
+
+
 def torch_slices(dim: int, device: torch.device | str = "cpu") -> list[int]:
     """:func:`even_slices` of work that torch does; a single one where it has threads of its own, or works on a GPU.
 
@@ -191,8 +195,11 @@ def in_slices(run: Callable[[int, int], object], bounds: list[int]) -> None:
     _Job(slices).share(min(helpers, len(_helpers)))
 
 
-def at_once(*calls: Callable[[], Any]) -> list:
-    """What ``calls`` return. They run at the same time if threads are free; each may share its own work as well."""
-    found: dict[int, Any] = {}
-    in_slices(lambda number, _: found.update({number: calls[number]()}), list(range(len(calls) + 1)))
-    return [found[number] for number in range(len(calls))]
+def slice_by_slice(passes: Sequence[Callable[[int, int], object]], bounds: list[int]) -> None:
+    """Call each of ``passes`` with the bounds of a slice, one after the other, slice by slice."""
+
+    def run(low: int, high: int) -> None:
+        for each in passes:
+            each(low, high)
+
+    in_slices(run, bounds)

@@ -127,7 +127,7 @@ class Trainer:
         unsettled and renders several dB worse.
         """
         self._set_iteration(iteration)
-        self._radii = self._radii.new_zeros(len(self.model))  # largest in any view
+        self._radii = self._radii.new_empty(0)  # largest in any view; there was none yet
         steps = [Step(iteration, view, place) for place, view in enumerate(self.deck.deal(self.processes.images))]
         own = slice(self.processes.rank, None, self.processes.count)
         if len(self.photographs.kept) < len(self.scene.train) and not self.blocks:
@@ -180,7 +180,7 @@ class Trainer:
         with stage("densify"):
             for observe in having([self.growth] if self.config.learn.grows_at(step.iteration) else [], "observe"):
                 observe(out, step)
-        self._radii = torch.maximum(self._radii, out.radii)
+        self._radii = torch.maximum(self._radii, out.radii) if len(self._radii) else out.radii
 
     def _through(self, method: str, value: T, *arguments: Any) -> T:
         """What the parts and then the growth make of ``value``, one after another."""
