@@ -22,7 +22,6 @@ MANY = 10**7  # instances from which on their memory is asked for
 BYTES = 64  # of an instance: its place and blocks, what sorting it takes, and its row of gradients
 MAX_TILE = 2**24  # instances of one tile: the blends count them in float32
 IN_PIECES = 2**14  # splats for each of two threads that share a piece when depths are sorted, or more
-SHARES = 3  # slices that a thread packs, beside the one that sorts
 SAMPLE = 2**10  # depths that tell which range of them is whose
 
 
@@ -52,7 +51,7 @@ def bin_by_counting(
         """A slice of the groups; before the first, the depths of all: who is done sooner takes more slices."""
         pack(low, high) if low >= 0 else orders.append(order_by_depth(_taken(depths, drawn)))
 
-    in_slices(pack_or_sort, [-1, *even_slices(groups, each=LANES, shares=SHARES)])
+    in_slices(pack_or_sort, [-1, *falling_slices(groups, LANES)])
     (order,) = orders
     row_ends, begins, row_count = _sums(_taken(rows, order))
     check_count(row_count, camera, count, splats2d.radii.device)
