@@ -16,7 +16,7 @@ from warp_splat.kernels.simd import LANES
 from warp_splat.kernels.splat import Splat2D
 from warp_splat.raster.data import LESS, MAX_INSTANCES, Bins, Room, Splats2D, falloff_of
 from warp_splat.runtime.launch import bind, check_memory, empty, launch, read_later, send
-from warp_splat.runtime.pool import even_slices, falling_shares, falling_slices, in_slices, slice_count, torch_slices
+from warp_splat.runtime.pool import beside, even_slices, falling_slices, in_slices, slice_count, torch_slices
 
 MANY = 10**7  # instances from which on their memory is asked for
 BYTES = 64  # of an instance: its place and blocks, what sorting it takes, and its row of gradients
@@ -45,15 +45,9 @@ def bin_by_counting(
     gaussians, square = wp.array(drawn, copy=False, device="cpu"), int(options.extent == "square")
     inputs, groups = [gaussians, splats2d.view(), camera.height, options.alpha_min, square], -(-count // LANES)
     pack = bind(lists.make_pack(falloff_of(options).reach_of), inputs, [splats, rows], "cpu")
-    depths, orders = splats2d.depths.detach().numpy(), list[np.ndarray]()
-
-    def pack_or_sort(low: int, high: int) -> None:
-        """A slice of the groups; before the first, the depths of all: who is done sooner takes more slices."""
-        pack(low, high) if low >= 0 else orders.append(order_by_depth(_taken(depths, drawn)))
-
-    in_slices(pack_or_sort, [-1, *falling_slices(groups, LANES)])
-    (order,) = orders
-    row_ends, begins, row_count = _sums(_taken(rows, order))
+    depths = splats2d.depths.detach().numpy()
+    order = beside(lambda: order_by_depth(_taken(depths, drawn)), pack, falling_slices(groups, LANES))
+    edges, begins, row_count = _sums(_taken(rows, order))
     check_count(row_count, camera, count, splats2d.radii.device)
     spans, counts = empty(row_count, wp.vec2i, "cpu"), np.empty(count, dtype=np.int64)
     inputs = [splats, rows, _put(begins, order), camera.width, camera.height, tiles_x, square]
@@ -62,13 +56,13 @@ def bin_by_counting(
     if worlds:
         first = _first_tiles(worlds, tiles_x * tiles_y, splats2d.radii.device)[drawn[order]]
         wp.to_torch(spans)[:, 0] += torch.repeat_interleave(first, torch.from_numpy(_taken(rows, order)))
-    bands = [0, *np.searchsorted(row_ends, even_slices(row_count)[1:-1]).tolist(), count]  # of as many rows each
-    cursor, ends = _count_bands(bands, row_ends, spans, tiles_x * tiles_y * pictures)
-    _, begins, total = _sums(counts)
+    bands = np.array([0, *np.searchsorted(edges[1:], even_slices(row_count)[1:-1]), count], dtype=np.int32)  # by rows
+    cursor, ends, (_, begins, total) = _count_bands(edges[bands], spans, tiles_x * tiles_y * pictures, counts)
     check_count(total, camera, count, splats2d.radii.device)
     _check_longest(int(np.diff(ends, prepend=0).max(initial=0)))
     instances, places = (torch.empty(total, dtype=torch.int32, device="cpu") for _ in range(2))
-    _launch_bands(lists.scatter, bands, [order, begins, row_ends, spans], [cursor, instances, places])
+    inputs, outputs = [bands, order, begins, edges[1:], spans], [cursor, instances, places]
+    launch(lists.scatter, len(bands) - 1, inputs, outputs, bounds=list(range(len(bands))))
     ranges = torch.from_numpy(np.stack([np.concatenate([[0], ends[:-1]]), ends], 1).astype(np.int32))
     found = (instances, places, torch.from_numpy(begins), ranges, balanced_slices(ends))
     return Bins(len(radii), gaussians, splats, *found, tiles_x, camera.height, invalid, pictures)
@@ -152,25 +146,28 @@ def count_twice(splats2d: Splats2D, camera: Camera, options: RasterOptions) -> t
     return counts, again
 
 
-def _count_bands(bounds: list[int], row_ends: np.ndarray, spans: wp.array, tiles: int) -> tuple[np.ndarray, np.ndarray]:
-    """Where each band's instances of each tile go [B, T], after those of the bands before it; each tile's end [T]."""
-    rows = [int(row_ends[bound - 1]) if bound else 0 for bound in bounds]
+def _count_bands(bounds: np.ndarray, spans: wp.array, tiles: int, counts: np.ndarray) -> tuple:
+    """Where each band's instances of each tile go [B, T], after those of the bands before it; each tile's end [T].
+
+    Bands lie between ``bounds`` in ``spans``. And the sums of ``counts``, which are found meanwhile.
+    """
     changes = np.zeros((len(bounds) - 1, tiles + 1), dtype=np.int32)
-    _launch_bands(lists.count_tiles, rows, [spans], [changes])
-    counts = np.cumsum(changes[:, :-1], axis=1, dtype=np.int32)
-    totals = counts.sum(0, dtype=np.int64)
-    begins, ends = np.empty_like(counts), np.cumsum(totals)
+    count = bind(lists.count_tiles, [bounds.astype(np.int32), spans], [changes], "cpu")
+    sums = beside(lambda: _sums(counts), count, list(range(len(bounds))))
+    found = np.cumsum(changes[:, :-1], axis=1, dtype=np.int32)
+    totals = found.sum(0, dtype=np.int64)
+    begins, ends = np.empty_like(found), np.cumsum(totals)
     begins[0] = ends - totals
-    for band in range(1, len(counts)):
-        np.add(begins[band - 1], counts[band - 1], out=begins[band])
-    return begins, ends
+    for band in range(1, len(found)):
+        np.add(begins[band - 1], found[band - 1], out=begins[band])
+    return begins, ends, sums
 
 
 def _sums(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
-    """Where each of the counted ends, in 64 bits, because 32 wrap without a word, and begins, in 32; and their sum."""
-    ends = np.zeros(len(counts) + 1, dtype=np.int64)
-    torch.cumsum(torch.from_numpy(counts), 0, out=torch.from_numpy(ends[1:]))  # in a quarter of numpy's time
-    return ends[1:], ends[:-1].astype(np.int32), int(ends[-1])
+    """Where the counted begin and the last ends [V + 1], in 64 bits: 32 wrap without a word; in 32 [V]; their sum."""
+    edges = np.zeros(len(counts) + 1, dtype=np.int64)
+    torch.cumsum(torch.from_numpy(counts), 0, out=torch.from_numpy(edges[1:]))  # in a quarter of numpy's time
+    return edges, edges[:-1].astype(np.int32), int(edges[-1])
 
 
 def _taken(values: np.ndarray, indices: np.ndarray) -> np.ndarray:
@@ -209,7 +206,7 @@ def _check_longest(count: int) -> None:
 def balanced_slices(ends: np.ndarray) -> list[int]:
     """Bounds of slices of tiles by the number of their instances; an empty tile counts a little, too."""
     work = ends + 32 * np.arange(1, len(ends) + 1)
-    return [0, *np.searchsorted(work, work[-1] * falling_shares(int(work[-1]))[1:-1]).tolist(), len(ends)]
+    return [0, *np.searchsorted(work, falling_slices(int(work[-1]))[1:-1]).tolist(), len(ends)]
 
 
 def order_by_depth(depths: np.ndarray) -> np.ndarray:
@@ -234,9 +231,3 @@ def order_by_depth(depths: np.ndarray) -> np.ndarray:
         in_slices(lambda number, _: ranges[number].sort(), list(range(pieces + 1)))
         keys = np.concatenate(ranges)
     return keys.astype(np.int32)
-
-
-def _launch_bands(kernel: wp.Kernel, bounds: list[int], inputs: Sequence, outputs: Sequence) -> None:
-    """Launch ``kernel`` on the bands between ``bounds``, one for each thread."""
-    bands = np.array(bounds, dtype=np.int32)
-    launch(kernel, len(bounds) - 1, [bands, *inputs], outputs, bounds=list(range(len(bounds))))

@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import partial
 from numbers import Integral
+from typing import Any
 
 import numpy as np
 import torch
@@ -192,6 +193,13 @@ def in_slices(run: Callable[[int, int], object], bounds: list[int]) -> None:
             helper.start()
             _helpers.append(helper)
     _Job(slices).share(min(helpers, len(_helpers)))
+
+
+def beside(alone: Callable[[], Any], run: Callable[[int, int], object], bounds: list[int]) -> Any:
+    """What ``alone`` returns, which one thread calls first; slices of ``run`` from 0 on are shared meanwhile."""
+    found = []
+    in_slices(lambda low, high: run(low, high) if low >= 0 else found.append(alone()), [-1, *bounds])
+    return found[0]
 
 
 def slice_by_slice(passes: Sequence[Callable[[int, int], object]], bounds: list[int]) -> None:
