@@ -150,6 +150,14 @@ def test_who_gets_no_more_threads_does_with_those_there_are(threads, monkeypatch
     assert sorted(done) == sorted([*range(5)] * 2) and not pool._helpers
 
 
+def test_one_call_goes_beside_slices(threads):
+    done = []
+    assert pool.beside(lambda: "alone", lambda low, high: done.extend(range(low, high)), [0, 2, 2, 5]) == "alone"
+    assert sorted(done) == [*range(5)]
+    for bounds in ([0, 0], [0]):  # nothing to share
+        assert pool.beside(lambda: 7, done.append, bounds) == 7
+
+
 def test_slices_share_their_own_work(threads):
     done = []
 
