@@ -90,9 +90,9 @@ class Blends:
 
     def upstream(self, slots: torch.Tensor) -> None:
         states = (self.background, self.saved)
-        found, before = CUDA.spread_upstream(self.bins, self.options, *states, self.adj_pixels, slots)
+        found = CUDA.spread_upstream(self.bins, self.options, *states, self.adj_pixels, slots)
+        (self.up, self.adj_final), _, _, self.steps, before = found
         CUDA.launch_tiles(self.bins, before)
-        (self.up, self.adj_final), _, _, self.steps = found
 
     def reverse(self, kernel: wp.Kernel, rows: torch.Tensor) -> None:
         inputs = [self.bins.view(), alphas_of(self.options), *self.saved[:2], self.steps, self.up, self.adj_final]

@@ -15,7 +15,7 @@ those of 16 threads, all run by one. Sizes are those of ``step.py``; times are t
 
 import threading
 import time
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable
 from unittest import mock
 
@@ -36,7 +36,7 @@ SHARED, MORE = max(CORES, 2), 4 * max(CORES, 2)  # threads that share the work
 MANY = 16  # threads for which a step on one is cut
 HOST, WHOLE = "host", "whole step"
 
-Spans = list[tuple[float, float]]
+Spans = list[tuple[float, float, int]]  # beginning, end and thread
 
 
 class Clock(defaultdict):
@@ -55,13 +55,14 @@ class Clock(defaultdict):
 
 
 def shared(spans: Spans, start: float, end: float) -> float:
-    """Seconds between ``start`` and ``end`` in which at least two of ``spans`` overlap."""
-    within = [(max(begin, start), min(stop, end)) for begin, stop in spans if begin < end and stop > start]
-    events = sorted([(begin, 1) for begin, _ in within] + [(stop, -1) for _, stop in within])
-    found, running, before = 0.0, 0, start
-    for moment, change in events:
-        found += moment - before if running > 1 else 0.0
-        running, before = running + change, moment
+    """Seconds between ``start`` and ``end`` in which at least two threads have a span; one's may lie in another."""
+    within = [(max(begin, start), min(stop, end), who) for begin, stop, who in spans if begin < end and stop > start]
+    events = sorted([(begin, 1, who) for begin, _, who in within] + [(stop, -1, who) for _, stop, who in within])
+    found, running, before = 0.0, Counter(), start
+    for moment, change, who in events:
+        found += moment - before if len(+running) > 1 else 0.0
+        running[who] += change
+        before = moment
     return found
 
 
@@ -74,7 +75,7 @@ def timed(clock: Clock, run: Callable[[], None]) -> Callable[[], None]:
             run()
         finally:
             with clock.lock:
-                clock.spans.append((begin, time.perf_counter()))
+                clock.spans.append((begin, time.perf_counter(), threading.get_ident()))
 
     return call
 

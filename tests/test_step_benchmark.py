@@ -140,8 +140,8 @@ def test_degree_rises_without_a_compilation(monkeypatch, capsys):
 
 def test_serial_time_is_what_slices_do_not_share(two_threads):
     """Spans by hand; and a step, of which no stage is longer in serial than it is."""
-    assert serial.shared([(0.0, 2.0), (1.0, 4.0), (1.5, 1.75), (6.0, 7.0)], 0.5, 6.5) == pytest.approx(1.0)
-    assert serial.shared([(0.0, 2.0), (1.0, 4.0)], 1.5, 3.0) == pytest.approx(0.5)
+    assert serial.shared([(0.0, 2.0, 1), (1.0, 4.0, 2), (1.5, 1.75, 3), (6.0, 7.0, 1)], 0.5, 6.5) == pytest.approx(1.0)
+    assert serial.shared([(0.0, 2.0, 1), (1.0, 4.0, 2), (1.0, 4.0, 2)], 1.5, 3.0) == pytest.approx(0.5)
     assert serial.shared([], 0.0, 1.0) == 0.0
     job = pool._Job
     seconds, alone = serial.measure(made_up.steps_of(made_up.make_trainer(3000, 64, 48, "cpu")), 2)

@@ -16,7 +16,7 @@ from warp_splat.kernels.simd import LANES
 from warp_splat.kernels.splat import Splat2D
 from warp_splat.raster.data import LESS, MAX_INSTANCES, Bins, Room, Splats2D, falloff_of
 from warp_splat.runtime.launch import bind, check_memory, empty, launch, read_later, send
-from warp_splat.runtime.pool import beside, even_slices, falling_slices, in_slices, slice_count, torch_slices
+from warp_splat.runtime.pool import even_slices, falling_slices, in_slices, slice_count, torch_slices, with_slices
 
 MANY = 10**7  # instances from which on their memory is asked for
 BYTES = 64  # of an instance: its place and blocks, what sorting it takes, and its row of gradients
@@ -46,7 +46,7 @@ def bin_by_counting(
     inputs, groups = [gaussians, splats2d.view(), camera.height, options.alpha_min, square], -(-count // LANES)
     pack = bind(lists.make_pack(falloff_of(options).reach_of), inputs, [splats, rows], "cpu")
     depths = splats2d.depths.detach().numpy()
-    order = beside(lambda: order_by_depth(_taken(depths, drawn)), pack, falling_slices(groups, LANES))
+    order = with_slices(lambda: order_by_depth(_taken(depths, drawn)), pack, falling_slices(groups, LANES))
     edges, begins, row_count = _sums(_taken(rows, order))
     check_count(row_count, camera, count, splats2d.radii.device)
     spans, counts = empty(row_count, wp.vec2i, "cpu"), np.empty(count, dtype=np.int64)
@@ -56,7 +56,7 @@ def bin_by_counting(
     if worlds:
         first = _first_tiles(worlds, tiles_x * tiles_y, splats2d.radii.device)[drawn[order]]
         wp.to_torch(spans)[:, 0] += torch.repeat_interleave(first, torch.from_numpy(_taken(rows, order)))
-    bands = np.array([0, *np.searchsorted(edges[1:], even_slices(row_count)[1:-1]), count], dtype=np.int32)  # by rows
+    bands = np.array([0, *np.searchsorted(edges[1:], even_slices(row_count)[1:-1]), count], dtype=np.int32)  # of rows
     cursor, ends, (_, begins, total) = _count_bands(edges[bands], spans, tiles_x * tiles_y * pictures, counts)
     check_count(total, camera, count, splats2d.radii.device)
     _check_longest(int(np.diff(ends, prepend=0).max(initial=0)))
@@ -153,7 +153,7 @@ def _count_bands(bounds: np.ndarray, spans: wp.array, tiles: int, counts: np.nda
     """
     changes = np.zeros((len(bounds) - 1, tiles + 1), dtype=np.int32)
     count = bind(lists.count_tiles, [bounds.astype(np.int32), spans], [changes], "cpu")
-    sums = beside(lambda: _sums(counts), count, list(range(len(bounds))))
+    sums = with_slices(lambda: _sums(counts), count, list(range(len(bounds))))
     found = np.cumsum(changes[:, :-1], axis=1, dtype=np.int32)
     totals = found.sum(0, dtype=np.int64)
     begins, ends = np.empty_like(found), np.cumsum(totals)
@@ -164,7 +164,7 @@ def _count_bands(bounds: np.ndarray, spans: wp.array, tiles: int, counts: np.nda
 
 
 def _sums(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
-    """Where the counted begin and the last ends [V + 1], in 64 bits: 32 wrap without a word; in 32 [V]; their sum."""
+    """Where the counted begin, and the last end [V + 1], in 64 bits: 32 wrap silently; begins in 32 [V]; their sum."""
     edges = np.zeros(len(counts) + 1, dtype=np.int64)
     torch.cumsum(torch.from_numpy(counts), 0, out=torch.from_numpy(edges[1:]))  # in a quarter of numpy's time
     return edges, edges[:-1].astype(np.int32), int(edges[-1])

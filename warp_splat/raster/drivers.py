@@ -39,7 +39,7 @@ class Driver:
     peeks: bool  # whether to look at a result between two kernels: on a GPU the host would have to wait for it
     bin: Callable[..., Bins]
     gather: Callable[..., list[torch.Tensor]]
-    launch_tiles: Callable[..., None]  # on those of bins: a kernel, inputs, outputs, maybe its adjoint's; and the next
+    launch_tiles: Callable[..., None]  # of bins: (kernel, inputs, outputs, maybe its adjoint's), then the next
     kernels: ModuleType  # the package of those that take a tile: modules and makers have the same names in both
     shape: tuple[int, ...]  # of a number for each pixel of a tile, as its kernels have it
     counts: torch.dtype  # of a number of instances there
@@ -87,8 +87,8 @@ class Driver:
             adj_pixels: upstream gradients; dense.
         """
         slots = background.new_empty(len(bins.instances), variant_of(options).columns)  # a row per tile instance
-        found, before = self.spread_upstream(bins, options, background, saved, adj_pixels, slots)
-        up, adj_background, dropped, steps = found
+        found = self.spread_upstream(bins, options, background, saved, adj_pixels, slots)
+        up, adj_background, dropped, steps, before = found
         self.differentiate(mode, bins, options, saved, up, steps, slots, before)
         if self.peeks:  # numpy's sum is one after another, whatever the number of torch's threads
             return slots, torch.from_numpy(adj_background.numpy().sum(0)), dropped
@@ -99,7 +99,7 @@ class Driver:
     ) -> tuple:
         """(Upstream gradients by pixel, dL/dT behind), dL/dbackground, dropped and steps of each tile; what finds them.
 
-        Zeros in ``slots``, for the instances that the adjoint does not walk.
+        That writes zeros into ``slots`` as well, for the instances that the adjoint does not walk.
         """
         tile_count, new = len(bins.ranges), background.new_empty
         variant = variant_of(options)
@@ -108,8 +108,8 @@ class Driver:
         dropped, steps = (new(tile_count, dtype=torch.int32) for _ in range(2))
         inputs = [bins.view(), background, saved.final, saved.count, adj_pixels.view()]
         outputs = [up, adj_final, adj_background, dropped, steps, slots]
-        found = (up, adj_final), adj_background, dropped, steps
-        return found, (self.kernels.adjoint.make_upstream(variant), inputs, outputs)
+        before = self.kernels.adjoint.make_upstream(variant), inputs, outputs
+        return (up, adj_final), adj_background, dropped, steps, before
 
     def differentiate(
         self, mode: str, bins: Bins, options: RasterOptions, saved: Saved, upstream, steps, slots: torch.Tensor, before

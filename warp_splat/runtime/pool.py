@@ -143,7 +143,7 @@ def slice_count(work: int, shares: int = 1, smallest: int = 0) -> int:
 
 def even_slices(dim: int, smallest: int = 0, each: int = 1, device: torch.device | str = "cpu") -> list[int]:
     """Bounds of a slice per thread of ``dim`` pieces of work, of ``each`` indices; of one slice on a GPU."""
-    parts = 1 if torch.device(device).type == "cuda" else slice_count(dim * each, 1, smallest)
+    parts = 1 if torch.device(device).type == "cuda" else slice_count(dim * each, smallest=smallest)
     return [dim * part // parts for part in range(parts + 1)]
 
 
@@ -151,8 +151,7 @@ def falling_shares(work: int) -> np.ndarray:
     """Bounds, from 0 to 1, of slices of ``work`` indices whose cost is not known well: if many, the last are small.
 
     So all threads end at about the same time. With equal slices, eight to a thread for the blends and one for Adam, a
-    step of 200,000 Gaussians took 3 % longer on two threads. No gain for the projection,
-    whose slices take some Python.
+    step of 200,000 Gaussians took 3 % longer on two threads. The projection, whose slices take Python, gains nothing.
     """
     parts = slice_count(work, PER_THREAD if work >= 2 * _threads * SMALLEST_SLICE else 1)
     power = max(3.0 * parts / (PER_THREAD * _threads), 1.0)  # the first is 0.4 of a thread's share, or all are equal
@@ -195,7 +194,7 @@ def in_slices(run: Callable[[int, int], object], bounds: list[int]) -> None:
     _Job(slices).share(min(helpers, len(_helpers)))
 
 
-def beside(alone: Callable[[], Any], run: Callable[[int, int], object], bounds: list[int]) -> Any:
+def with_slices(alone: Callable[[], Any], run: Callable[[int, int], object], bounds: list[int]) -> Any:
     """What ``alone`` returns, which one thread calls first; slices of ``run`` from 0 on are shared meanwhile."""
     found = []
     in_slices(lambda low, high: run(low, high) if low >= 0 else found.append(alone()), [-1, *bounds])

@@ -136,6 +136,7 @@ class Trainer:
         losses = self.blocks.differentiate(steps) if self.blocks else [self.differentiate_view(s) for s in steps[own]]
         loss = sum(losses[1:], losses[0])
         if self.config.learn.optimizer_type == "sparse_adam":
+            self._radii = self._radii.clone()  # parts may have kept what they saw
             self.processes.merge(self._radii, largest=True)
         self.processes.average([*self.model.gradients(self.degree), *self.optimizer.part_gradients(), loss])
         return loss
