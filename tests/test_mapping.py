@@ -6,9 +6,13 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
+from hostile import refusal
+from scene_files import write_image
 
 from warp_splat.config import SfmConfig
+from warp_splat.formats.model_folder import claimed
 from warp_splat.sfm import mapping
+from warp_splat.sfm.command import sfm
 from warp_splat.sfm.matching import fitting
 
 COUNT = 20
@@ -52,11 +56,17 @@ def test_models_that_share_photographs_are_joined(truth, tmp_path):
     moved = pycolmap.Sim3d(2.0, pycolmap.Rotation3d(np.array([0.1, 0.5, 0.2])), np.array([1.0, 2, 3]))
     parts = [range(8), range(5, 14), range(14, COUNT)]
     models = [part_of(model, tmp_path / str(k), part, moved if k else None) for k, part in enumerate(parts)]
-    found, others = mapping.joined(models, database, tmp_path, tmp_path, 1)
+    found, others = mapping.joined(models, database, tmp_path, tmp_path)
     assert found.num_reg_images() == 14 and farthest(found, model) < 1e-4
     assert found.compute_mean_reprojection_error() < 0.01
     seen = set(found.reg_image_ids())
     assert [other.num_reg_images() for other in others if not seen.intersection(other.reg_image_ids())] == [6]
+
+
+def test_a_folder_where_another_run_works_is_refused(tmp_path):
+    write_image(tmp_path / "photos" / "0.png", np.zeros((8, 8, 3), np.uint8))
+    with claimed(tmp_path / "scene" / "sfm"):
+        refusal(lambda: sfm(SfmConfig(str(tmp_path / "photos"), str(tmp_path / "scene"))), "another run writes here")
 
 
 @pytest.fixture

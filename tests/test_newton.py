@@ -127,6 +127,37 @@ def test_the_depth_of_meshes_may_be_written_over(simulation):
     assert all(map(np.array_equal, *found)) and {0, 77} < set(np.unique(found[0][0]))
 
 
+def test_what_meshes_show_may_be_written_over_on_a_tape(simulation):
+    camera, rng = camera_of_fov(WIDTH, HEIGHT, FOV), np.random.default_rng(0)
+    depth = rng.uniform(-3, 7, (2, HEIGHT, WIDTH)).astype(np.float32)
+    color = rng.integers(0, 2**32, depth.shape, dtype=np.uint64).astype(np.uint32)
+    found = []
+    for over in (False, True):
+        state, transforms = state_of(simulation), wp.array(CAMERAS, dtype=wp.transform, requires_grad=True)
+        meshes = {"mesh_depth": wp.array(depth, dtype=float), "mesh_color": wp.array(color, dtype=wp.uint32)}
+        made = images(rgb_image=wp.vec3, forward_depth_image=float, color_image=wp.uint32)
+        made |= dict(zip(("forward_depth_image", "color_image"), meshes.values(), strict=True)) if over else {}
+        with wp.Tape() as recorded:
+            simulation.sensor.update(state, transforms, camera, **made, **meshes)
+        recorded.backward(grads={made["rgb_image"]: wp.full((2, HEIGHT, WIDTH), wp.vec3(1.0, 2.0, 3.0), dtype=wp.vec3)})
+        found.append([state.body_q.grad.numpy().copy(), transforms.grad.numpy()])
+    assert all((one == other).all() and other.any() for one, other in zip(*found, strict=True))
+
+
+@pytest.mark.parametrize("opacity", [0.06, 0.012])  # of all 92 % and 38 %
+def test_a_thick_fog_is_named_and_not_the_mesh_behind(opacity):
+    count, builder, size = 40, newton.ModelBuilder(), (1, HEIGHT, WIDTH)
+    places = np.stack([np.zeros(count), np.zeros(count), -3 - 0.01 * np.arange(count)], 1)
+    fog = newton.Gaussian(places, None, np.full((count, 3), 5.0), np.full(count, opacity), np.ones((count, 3)))
+    shape = builder.add_shape_gaussian(-1, gaussian=fog, cfg=UNSEEN)
+    model, named = builder.finalize(device="cpu"), wp.zeros(size, dtype=wp.uint32)
+    meshes = {"mesh_depth": wp.full(size, 6.0, dtype=float), "mesh_index": wp.full(size, 77, dtype=wp.uint32)}
+    eye = wp.array([(0, 0, 0, 0, 0, 0, 1)], dtype=wp.transform)
+    camera, sensor = camera_of_fov(WIDTH, HEIGHT, 0.5), SensorSplatCamera(model)
+    sensor.update(model.state(), eye, camera, shape_index_image=named, **meshes)
+    assert (named.numpy() == (shape if opacity > 0.03 else 77)).all()
+
+
 def test_a_world_without_gaussians_shows_those_of_all(simulation):
     """Or nothing, if there are none."""
     for shared in (True, False):

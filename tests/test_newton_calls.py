@@ -7,12 +7,16 @@ from functools import partial
 
 import numpy as np
 import pytest
+import torch
 import warp as wp
 from hostile import refusal
 from simulations import CAMERAS, FOV, HEIGHT, WIDTH, images, make_simulation, newton, state_of
+from splat_files import small_splats
 
 from warp_splat import Lens, RasterOptions
-from warp_splat.newton import SensorSplatCamera, camera_of_fov
+from warp_splat.formats.exchange import save_gaussians
+from warp_splat.formats.splats import SplatFile
+from warp_splat.newton import SensorSplatCamera, camera_of_fov, gaussian_of_file
 
 
 @pytest.fixture(scope="module")
@@ -117,6 +121,11 @@ def test_what_newtons_tiled_camera_is_told_this_one_understands(simulation):
     assert len(np.unique(color.numpy(), axis=0)) == len(np.unique(color.numpy(), axis=1)) == 2
 
 
+def test_a_file_without_gaussians_is_no_shape(tmp_path):
+    save_gaussians(path := tmp_path / "none.ply", SplatFile(small_splats(3, 4, 1).take([])))
+    refusal(lambda: gaussian_of_file(path), "none.ply: expected Gaussians, found none")
+
+
 def test_refused_in_one_sentence(simulation):
     empty = newton.ModelBuilder().finalize(device="cpu")
     refusal(lambda: SensorSplatCamera(empty), "expected a Gaussian shape")
@@ -138,6 +147,9 @@ def test_refused_in_one_sentence(simulation):
     refusal(lambda: SensorSplatCamera(simulation.model, background=0), "background: expected three numbers")
     named = wp.zeros((2, 32, 40), dtype=wp.uint32)
     refusal(partial(update, shape_index_image=named, mesh_index=named), "mesh_index: expected mesh_depth beside it")
+    hiding = SensorSplatCamera(simulation.model, options=RasterOptions(hidden_from=torch.ones(HEIGHT, WIDTH)))
+    depth = wp.zeros((2, HEIGHT, WIDTH), dtype=float)
+    refusal(lambda: hiding.update(state, transforms, camera, mesh_depth=depth), "none beside options.hidden_from")
     for worlds in ([0, 2], [0.5, 1.0], [0], 1):
         refusal(partial(update, world_indices=worlds), f"world_indices: expected 2 of 0..1, got {worlds}")
     refusal(lambda: camera_of_fov(WIDTH, HEIGHT, 0), "camera_fov: expected radians between 0 and pi, got 0")

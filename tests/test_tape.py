@@ -283,6 +283,7 @@ def test_worlds_are_separate_calls_into_one_array(device):
         tape.rasterize(*arrays.values(), scene.camera, options={}, hidden_from=wp.from_torch(surface[0]))
     refusal(lambda: tape.rasterize_worlds(**given, cameras=scene.camera), match="cameras: expected a sequence")
     refusal(lambda: tape.rasterize(*arrays.values(), scene.camera, out=images), match="got 'array'")
+    refusal(lambda: tape.rasterize_worlds(**given | {"out": 7}, cameras=cameras), match="got 'int'")
     wrong = {"image": r"out\['image'\]: expected .* got \[3, 3, 3\]", "depth": "some of image, alpha, got 'depth'"}
     for name, sentence in wrong.items():
         with pytest.raises(InputError, match=sentence):

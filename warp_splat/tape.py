@@ -265,7 +265,7 @@ def rasterize_worlds(
     checks.bases_of(cameras)
     found = []
     for world, camera in enumerate(cameras):
-        room = {name: of(world, name, array, 0) for name, array in (out or {}).items()}
+        room = {name: of(world, name, array, 0) for name, array in out.items()} if isinstance(out, Mapping) else out
         own = {name: of(world, name, value, RANKS.get(name, 9)) for name, value in given.items()}
         found.append(rasterize(**own, camera=camera, out=room))
     return found

@@ -86,22 +86,22 @@ def prepare_folder(folder: str | Path) -> Path:
 
 @contextmanager
 def claimed(folder: Path) -> Iterator[None]:
-    """:func:`prepare_folder` it, and keep other trainings out while the block runs.
+    """:func:`prepare_folder` it, and keep other trainings, or reconstructions, out while the block runs.
 
     Raises:
-        InputError: if the folder cannot be written, or a training in another process holds it.
+        InputError: if the folder cannot be written, or another process holds it.
     """
-    from filelock import FileLock, Timeout  # noqa: PLC0415 - only training needs it
+    from filelock import FileLock, Timeout  # noqa: PLC0415 - only these need it
 
     lock = FileLock(prepare_folder(folder) / ".lock")
     try:
         lock.acquire(timeout=0)
     except Timeout as error:
-        raise InputError(f"{folder}: another training writes here; wait for it, or choose another with -m.") from error
+        raise InputError(f"{folder}: another run writes here; wait for it, or choose another folder.") from error
     except OSError as error:
         raise InputError(
-            f"{lock.lock_file}: expected a file to write, which tells other trainings that this one is at work, found "
-            f"{error.strerror or error}; remove it if no training is at work there, or choose another folder with -m."
+            f"{lock.lock_file}: expected a file to write, which tells other runs that this one is at work, found "
+            f"{error.strerror or error}; remove it if none is at work there, or choose another folder."
         ) from error
     try:
         yield

@@ -122,7 +122,7 @@ def name_shapes(
     mesh_depth: wp.array3d[float],  # [V, H, W] or empty
     mesh_index: wp.array3d[wp.uint32],  # [V, H, W] or empty
     # out
-    index_out: wp.array3d[wp.uint32],  # [V, H, W] shape that is seen most
+    index_out: wp.array3d[wp.uint32],  # [V, H, W] shape of the strongest Gaussian, or mesh
 ):
     v, y, x = pixel_at(first + wp.tid(), alpha.shape[1], alpha.shape[2])
     index = NOTHING
@@ -131,6 +131,6 @@ def name_shapes(
         if mesh_depth[v, y, x] > 0.0:
             index = mesh_index[v, y, x]
             share = 1.0 - alpha[v, y, x]
-    if weights[v, y, x, 0] > share:
+    if weights[v, y, x, 0] > 0.0 and alpha[v, y, x] > share:
         index = owners[v, int(strongest[v, y, x, 0])]
     index_out[v, y, x] = index

@@ -130,7 +130,8 @@ class SensorSplatCamera:
             rgb_image: vec3, colors as trained, displayed without a change.
             color_image: uint32, the same packed as Newton packs RGBA.
             forward_depth_image: float, expected depth along the axis, of a wide lens the distance; 0 where nothing is.
-            shape_index_image: uint32, the shape seen most; 0xFFFFFFFF where nothing is.
+            shape_index_image: uint32, the shape of the Gaussian that is seen most, or the mesh, if more is seen of it
+                than of all Gaussians; 0xFFFFFFFF where nothing is.
             mesh_color: uint32, ``color_image`` of Newton's sensor: what is seen through the Gaussians.
             mesh_depth: float, its ``forward_depth_image``, for a wide lens its ``depth_image``: hides Gaussians whose
                 centers are farther.
@@ -138,8 +139,8 @@ class SensorSplatCamera:
             world_indices: world of each view, which the host reads; by default view i is world i.
 
         Raises:
-            InputError: if an image is of another shape, one of meshes has no depth, a view is of no world, or an
-                argument is of another type.
+            InputError: if an image is of another shape, one of meshes has no depth, or options.hidden_from beside it, a
+                view is of no world, or an argument is of another type.
         """
         given = {name: array for name, array in locals().items() if name in KINDS and array is not None}
         bodies = 0 if (placed := getattr(state, "body_q", None)) is None else len(placed)
@@ -162,6 +163,8 @@ class SensorSplatCamera:
                 raise InputError(f"{name}: expected {shape} of {kind.__name__}, got {found}.")
             if name in ("mesh_color", "mesh_index") and mesh_depth is None:
                 raise InputError(f"{name}: expected mesh_depth beside it, which says where meshes are, got None.")
+            if name == "mesh_depth" and self.options.hidden_from is not None:
+                raise InputError("mesh_depth: expected none beside options.hidden_from, which hides, too; omit one.")
         if camera_transforms.ndim == 2:  # one camera after another
             for number, one in enumerate(cameras):
                 column = {name: array[:, number] for name, array in given.items()}
@@ -178,18 +181,20 @@ class SensorSplatCamera:
         options, poseless = replace(self.options, **asked), {"rotation": np.eye(3), "translation": np.zeros(3)}
         lenses = {id(one): replace(one, **poseless) for one in cameras}
         cameras, place = [lenses[id(one)] for one in cameras], partial(self._place, state, camera_transforms)
+        # a tape reads them again, when they may be written over
+        color, depth = (wp.clone(a) if a and open_tape() else a for a in (mesh_color, mesh_depth))
         draw = self._draw_each
         if not open_tape() and options.hidden_from is None and all(takes(lens, options) for lens in lenses.values()):
             draw = partial(self._draw_together, camera_transforms)
-        for views, seen in draw(place, cameras, chosen.tolist(), options, mesh_depth):
-            surfaces, size = _part(mesh_depth, views), seen["alpha"].size
+        for views, seen in draw(place, cameras, chosen.tolist(), options, depth):
+            surfaces, size = _part(depth, views), seen["alpha"].size
             if shape_index_image is not None:  # first, because the depth of meshes may be written over
                 inputs = [seen["strongest"], seen["strongest_weights"], seen["alpha"]]
                 inputs += [self._owners_of(*chosen[views].tolist()), surfaces, _part(mesh_index, views)]
                 launch_on_tape(name_shapes, size, inputs, [_part(shape_index_image, views)], self.device)
             inputs = [seen["image"], seen["alpha"], seen.get("depth"), self.background]
             made = [_part(image, views) for image in (rgb_image, color_image, forward_depth_image)]
-            inputs += [_part(mesh_color, views), surfaces]
+            inputs += [_part(color, views), surfaces]
             launch_on_tape(put_among_meshes, size, inputs, made, self.device)
 
     def _draw_each(self, place, cameras, worlds, options, mesh_depth) -> Iterator[Seen]:
@@ -312,13 +317,16 @@ def camera_of_fov(width: int, height: int, camera_fov: float) -> Camera:
 def gaussian_of_file(path: str | Path, **more: Any) -> Any:
     """A ``newton.Gaussian`` of a file of any of our formats, in the axes of its training: y down, z forward.
 
-    ``more`` goes to its constructor.
+    ``more`` goes to its constructor. It knows no antialiasing: of a model that was trained so, give the sensor
+    ``RasterOptions(antialiasing=True)``.
 
     Raises:
-        InputError: if the file cannot be read, or the package newton is not installed.
+        InputError: if the file cannot be read or has no Gaussians, or the package newton is not installed.
     """
     newton = imported("newton", "newton: expected the package newton; `pip install 'newton>=1.8'`.")
     means, sh, opacities, scales, quats = load_gaussians(path).splats
+    if not len(means):
+        raise InputError(f"{path}: expected Gaussians, found none, and newton takes no shape without; name another.")
     coefficients = np.concatenate([sh[:, 0], sh[:, 1:].transpose(0, 2, 1).reshape(len(sh), -1)], 1)
     rotations = unit_quats(quats)[:, [1, 2, 3, 0]]
     return newton.Gaussian(means, rotations, np.exp(scales), sigmoid(opacities), coefficients, **more)

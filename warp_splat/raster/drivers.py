@@ -87,12 +87,11 @@ class Driver:
             adj_pixels: upstream gradients; dense.
         """
         slots = background.new_empty(len(bins.instances), variant_of(options).columns)  # a row per tile instance
-        found = self.spread_upstream(bins, options, background, saved, adj_pixels, slots)
-        up, adj_background, dropped, steps, before = found
+        up, behind, dropped, steps, before = self.spread_upstream(bins, options, background, saved, adj_pixels, slots)
         self.differentiate(mode, bins, options, saved, up, steps, slots, before)
         if self.peeks:  # numpy's sum is one after another, whatever the number of torch's threads
-            return slots, torch.from_numpy(adj_background.numpy().sum(0)), dropped
-        return slots, adj_background.sum(0), dropped
+            return slots, torch.from_numpy(behind.numpy().sum(0)), dropped
+        return slots, behind.sum(0), dropped
 
     def spread_upstream(
         self, bins: Bins, options: RasterOptions, background, saved: Saved, adj_pixels: Pixels, slots: torch.Tensor

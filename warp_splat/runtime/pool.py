@@ -203,9 +203,4 @@ def with_slices(alone: Callable[[], Any], run: Callable[[int, int], object], bou
 
 def slice_by_slice(passes: Sequence[Callable[[int, int], object]], bounds: list[int]) -> None:
     """Call each of ``passes`` with the bounds of a slice, one after the other, slice by slice."""
-
-    def run(low: int, high: int) -> None:
-        for each in passes:
-            each(low, high)
-
-    in_slices(run, bounds)
+    in_slices(lambda low, high: [each(low, high) for each in passes], bounds)

@@ -21,6 +21,7 @@ from warp_splat.config import CORES, SfmConfig
 from warp_splat.errors import InputError, refusing
 from warp_splat.formats.coordinates import write_coordinates
 from warp_splat.formats.files import write_json, write_text
+from warp_splat.formats.model_folder import claimed
 from warp_splat.runtime.devices import peak_memory
 from warp_splat.scene import has_cameras, images
 from warp_splat.scene.colmap_library import pycolmap, require_pycolmap
@@ -69,7 +70,7 @@ def sfm(config: SfmConfig) -> int:
             raise InputError(f"--coordinates {config.coordinates}: {scene} has those of {before}; remove its sparse/.")
         say(f"{scene} is complete already; remove it to start anew.")
     else:
-        with _explained(work):
+        with claimed(work), _explained(work):
             root = _frames(source, work, config, say) if is_video(source) else photo_root(source)
             names = find_files(root, PHOTOS, None if is_video(source) else scene)
             told = _reconstruct(root, names, scene, work, config, say)
@@ -99,7 +100,7 @@ def scene_for(photos: str, processes: int, **options: Any) -> str:
 def _explained(work: Path) -> Iterator[None]:
     """Turn what pycolmap raises, of a full disk or a damaged database, into a sentence; what was not begun goes."""
     advice = "; free some space if the disk is full and run again, or remove this folder to start anew."
-    with refusing((RuntimeError, ValueError), f"{work}: pycolmap cannot go on there", advice):
+    with refusing((RuntimeError, ValueError, IndexError), f"{work}: pycolmap cannot go on there", advice):
         try:
             yield
         except InputError:

@@ -117,7 +117,6 @@ def _map_globally(database: Path, root: Path, config: SfmConfig, part: Path, sec
     """Global mapping (GLOMAP, Pan et al. 2024), with focal lengths from the view graph where no file says them."""
     with pycolmap.Database.open(str(database)) as connection:
         known = all(camera.has_prior_focal_length for camera in connection.read_all_cameras())
-    # One thread: with two, each run ends in other bytes.
     options = pycolmap.GlobalPipelineOptions(num_threads=1, random_seed=config.seed)
     points = pycolmap.IncrementalPipelineOptions(num_threads=1, random_seed=config.seed)
 
@@ -172,7 +171,7 @@ def held_together(model: pycolmap.Reconstruction) -> set[int]:
 
 def _map_stepwise(database: Path, root: Path, config: SfmConfig, part: Path, start: Path | None = None) -> None:
     """Incremental mapping; from the model ``start`` on, with thresholds that are relaxed, if there is one."""
-    options = pycolmap.IncrementalPipelineOptions(num_threads=config.threads, random_seed=config.seed)
+    options = pycolmap.IncrementalPipelineOptions(num_threads=1, random_seed=config.seed)
     options.mapper.random_seed = options.triangulation.random_seed = config.seed
     if start:
         options.multiple_models = False
@@ -191,7 +190,8 @@ def _finish(database: Path, root: Path, config: SfmConfig, models: list[pycolmap
     """Write the first of ``models``, joined with others and completed, and those that show other photographs."""
     if not models:
         return
-    model, others = joined(models, database, root, part, config.threads)
+    pycolmap.set_random_seed(config.seed)  # as where no run was stopped before
+    model, others = joined(models, database, root, part)
     (part / "0").mkdir()
     model.write(str(part / "0"))
     if 0 < model.num_reg_images() < _sizes(database)[0]:
@@ -211,7 +211,7 @@ def _finish(database: Path, root: Path, config: SfmConfig, models: list[pycolmap
 
 
 def joined(
-    models: list[pycolmap.Reconstruction], database: Path, root: Path, part: Path, threads: int
+    models: list[pycolmap.Reconstruction], database: Path, root: Path, part: Path
 ) -> tuple[pycolmap.Reconstruction, list[pycolmap.Reconstruction]]:
     """The first of ``models`` with the cameras of all that share photographs with it, and the models that do not.
 
@@ -227,10 +227,9 @@ def joined(
                 continue
             other.transform(model_from_other)
             model = _with_cameras(model, other, database)
-            options = pycolmap.IncrementalPipelineOptions(num_threads=threads)
             paths = map(str, (database, root, part / "triangulated"))
-            model = pycolmap.triangulate_points(model, *paths, options=options)
-            pycolmap.bundle_adjustment(model)
+            model = pycolmap.triangulate_points(model, *paths, options={"num_threads": 1})
+            pycolmap.bundle_adjustment(model, {"ceres": {"solver_options": {"num_threads": 1}}})
             shutil.rmtree(part / "triangulated")
             break
         else:
