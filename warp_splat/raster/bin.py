@@ -56,7 +56,8 @@ def bin_by_counting(
     if worlds:
         first = _first_tiles(worlds, tiles_x * tiles_y, splats2d.radii.device)[drawn[order]]
         wp.to_torch(spans)[:, 0] += torch.repeat_interleave(first, torch.from_numpy(_taken(rows, order)))
-    bands = np.array([0, *np.searchsorted(edges[1:], even_slices(row_count)[1:-1]), count], dtype=np.int32)  # of rows
+    # of as many rows each
+    bands = np.array([0, *np.searchsorted(edges[1:], even_slices(row_count)[1:-1]), count], dtype=np.int32)
     cursor, ends, (_, begins, total) = _count_bands(edges[bands], spans, tiles_x * tiles_y * pictures, counts)
     check_count(total, camera, count, splats2d.radii.device)
     _check_longest(int(np.diff(ends, prepend=0).max(initial=0)))

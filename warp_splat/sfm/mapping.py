@@ -1,7 +1,8 @@
 """Cameras and points of photographs that are matched: by global mapping, by incremental where that is better.
 
 Models that share photographs become one, and photographs that are left are added to it. Each step has its folder, which
-gets its name when it is complete, so a run that was stopped goes on at the step.
+gets its name when it is complete, so a run that was stopped goes on at the step. Each takes one thread: with two, a run
+ends in other bytes, and no sooner.
 """
 
 from __future__ import annotations
