@@ -175,7 +175,7 @@ def test_a_folder_is_claimed_by_one_training(tmp_path):
     """Another process is refused while the block runs, and not any more once it has ended or was killed."""
     with started("-c", CLAIMING, tmp_path, stdin=subprocess.PIPE) as other:
         assert other.stdout.readline() == "in\n"
-        with pytest.raises(InputError, match="another training"), model_folder.claimed(tmp_path):
+        with pytest.raises(InputError, match="another run"), model_folder.claimed(tmp_path):
             pass
         other.kill()
     with model_folder.claimed(tmp_path):
