@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from commands import python
 from made_up import make_trainer
 
 from warp_splat import Camera, RasterOptions, rasterize
@@ -221,6 +222,21 @@ def test_a_training_is_the_same_on_any_number_of_threads(threads):
     found = state_after_steps()
     pool.set_threads(1)
     assert found == state_after_steps()
+
+
+IN_DEBUG_MODE = """
+import sys, warp
+sys.path += ["tests", "benchmarks"]
+import test_threads
+warp.config.mode, test_threads.pool.SMALLEST_SLICE = "debug", 256
+print(test_threads.state_after_steps())
+"""
+
+
+@pytest.mark.slow
+def test_in_debug_mode_warp_finds_no_index_out_of_bounds_and_no_byte_changes():
+    """There, a process ends at the first such index, and threads of ours would meet in Warp's own memory."""
+    assert python("-c", IN_DEBUG_MODE).stdout.split()[-1] == state_after_steps()
 
 
 def test_an_error_in_a_slice_reaches_the_caller(threads):

@@ -14,14 +14,14 @@ def make_gather(widths: tuple[int, ...]) -> wp.Kernel:
     vec = wp.types.vector(length=width, dtype=float)
     STEPS = wp.constant(wp.types.vector(length=width, dtype=int)(*[step for step in widths for _ in range(step)]))
 
-    @wp.func_native("__builtin_prefetch(&wp::index(rows, i)); __builtin_prefetch(&wp::index(rows, i).c[last]);")
+    @wp.func_native("__builtin_prefetch(rows.data + i); __builtin_prefetch(rows.data[i].c + last);")
     def ask(rows: wp.array[vec], i: int, last: int):
         """Bring both ends of a row into the cache."""
 
     @wp.func
     def store(columns: wp.array[wp.uint64], i: int, sums: vec):
         for column in range(width):
-            wp.array(ptr=columns[column], shape=(1,), dtype=float)[STEPS[column] * i] = sums[column]
+            wp.array(ptr=columns[column], shape=(STEPS[column] * i + 1,), dtype=float)[STEPS[column] * i] = sums[column]
 
     @wp.kernel(module="unique", module_options=dict(FORWARD_ONLY))
     def gather(
