@@ -251,10 +251,10 @@ def test_sparse_adam_moves_only_what_was_drawn():
     assert torch.allclose(moved, expected[:, None].expand(4, 3), atol=1e-6)
 
 
-@pytest.mark.parametrize("leaf", [torch.zeros(3, dtype=torch.float64), torch.zeros(4, 2).T])
+@pytest.mark.parametrize("leaf", [torch.zeros(3, dtype=torch.float64), torch.zeros(4, 2).T, torch.zeros(())])
 def test_what_a_part_learns_is_dense_float32(leaf):
     model = GaussianModel.from_points(np.eye(3), np.zeros((3, 3), np.uint8), 0)
-    with pytest.raises(InputError, match=r"parameters of a part: expected dense float32, got gain of torch\.float"):
+    with pytest.raises(InputError, match=r"expected dense float32 \[N, ...\], got gain of torch\.float"):
         Optimizer(model, TrainConfig().learn, EXTENT, parts=[{"name": "gain", "params": [leaf], "lr": 0.1}])
 
 

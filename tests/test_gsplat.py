@@ -239,9 +239,10 @@ def test_ids_of_instances_are_read_as_gsplat_reads_them(size):
     assert torch.equal(begins.int(), meta["isect_offsets"].flatten())
 
 
-def test_no_gaussians():
-    nothing = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "colors": (9, 3)}
-    call = call_of(**{name: torch.zeros(0, *shape) for name, shape in nothing.items()}, backgrounds=torch.ones(2, 3))
+@pytest.mark.parametrize("colors", [(0, 9, 3), (2, 0, 9, 3)])  # of all cameras, of each
+def test_no_gaussians(colors):
+    nothing = {"means": (0, 3), "quats": (0, 4), "scales": (0, 3), "opacities": (0,), "colors": colors}
+    call = call_of(**{name: torch.zeros(shape) for name, shape in nothing.items()}, backgrounds=torch.ones(2, 3))
     for packed in (True, False):
         image, alpha, meta = rasterization(**call, packed=packed)
         assert (image == 1).all() and not alpha.any() and len(meta["flatten_ids"]) == 0

@@ -32,7 +32,7 @@ class Gain:
     """The logarithm of a factor for each photograph, learned by Adam; it also asks for depth and counts steps."""
 
     def __init__(self, options, setting):
-        self.options, self.steps = options, torch.zeros(1, dtype=torch.int32)
+        self.options, self.steps = options, torch.zeros(1, dtype=torch.int64)
         self.places = {view: place for place, view in enumerate(setting.scene.train)}
         self.gains = torch.zeros(len(self.places), device=setting.model.device, requires_grad=True)
 
@@ -62,7 +62,7 @@ class Gain:
 
     def restore(self, checkpoint):
         if "gain.steps" in checkpoint.arrays:
-            self.steps = torch.from_numpy(checkpoint.array("gain.steps", (1,), "int32").copy())
+            self.steps = torch.from_numpy(checkpoint.array("gain.steps", (1,), "int64").copy())
 
 
 @dataclass(frozen=True)

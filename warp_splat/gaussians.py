@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from torch.autograd.function import once_differentiable
 
 from warp_splat.formats.curve import along_curve, keys_of
 from warp_splat.formats.ply import save_ply_parts
@@ -18,6 +17,7 @@ from warp_splat.kernels.harmonics import C0
 from warp_splat.raster.data import Gaussians
 from warp_splat.raster.drivers import driver_of
 from warp_splat.runtime.distributed import ALONE, Processes
+from warp_splat.runtime.first_order import adjoint_of
 from warp_splat.runtime.launch import launch_in_lanes
 
 INITIAL_OPACITY = 0.1
@@ -47,7 +47,7 @@ class Activate(torch.autograd.Function):
         return found
 
     @staticmethod
-    @once_differentiable
+    @adjoint_of("activation")
     def backward(ctx, *adj_outputs):
         return _launched(make_adj_activate, *ctx.saved_tensors, *(adj.contiguous() for adj in adj_outputs))
 
@@ -61,7 +61,7 @@ class Taken(torch.autograd.Function):
         return leaf[rows]
 
     @staticmethod
-    @once_differentiable
+    @adjoint_of("rows")
     def backward(ctx, adj_rows):
         known = {"is_coalesced": True, "check_invariants": False}  # indices ascend
         return torch.sparse_coo_tensor(ctx.rows[None], adj_rows, ctx.shape, **known), None

@@ -32,7 +32,7 @@ from warp_splat.runtime.distributed import Processes
 
 LAST = "checkpoint.safetensors"  # where the run in a model folder stands
 FORMAT = 1  # rises when older programs could not read what newer ones write
-DTYPES = {"F32": np.float32, "F64": np.float64, "I32": np.int32, "U8": np.uint8}
+DTYPES = {"F32": np.float32, "F64": np.float64, "I32": np.int32, "I64": np.int64, "U8": np.uint8, "BOOL": np.bool_}
 EXPECTED = "a checkpoint of this program"
 GENERATOR_BYTES, TWISTER_WORDS = 5056, 624  # of the state of torch's generator on the CPU, a Mersenne Twister
 
@@ -84,7 +84,7 @@ def save_checkpoint(path: str | Path, arrays: Mapping[str, np.ndarray], facts: M
 
     Args:
         path: the file.
-        arrays: float32, float64, int32 or uint8.
+        arrays: float32, float64, int32, int64, uint8 or bool.
         facts: values of JSON.
 
     Raises:

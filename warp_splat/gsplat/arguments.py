@@ -86,7 +86,7 @@ def check_request(request: Request) -> Request:
             raise InputError(f"{name}: expected matrices from world to camera, got one that has no inverse.")
     if not bool(flat["Ks"].detach()[..., (0, 1), (0, 1)].all()):
         raise InputError("Ks: expected matrices with focal lengths fx and fy [px], got a singular one; correct it.")
-    flat["colors"] = colors.reshape(math.prod(batch), -1 if per_view else 1, *colors.shape[len(batch) + per_view :])
+    flat["colors"] = colors.reshape(math.prod(batch), cameras**per_view, *colors.shape[len(batch) + per_view :])
     flat |= {name: int(given[name]) for name in ("width", "height")}
     return Request(**(given | flat | {"rolling_shutter": shutter, "batch": batch}))
 

@@ -2,7 +2,6 @@
 
 import numpy as np
 import torch
-from torch.autograd.function import once_differentiable
 
 from warp_splat.camera import Camera
 from warp_splat.config import RasterOptions
@@ -12,6 +11,7 @@ from warp_splat.raster.beside import absolute_gradients, blend_channels
 from warp_splat.raster.blend import Blending, blend
 from warp_splat.raster.data import Bins, Splats2D
 from warp_splat.raster.drivers import driver_of
+from warp_splat.runtime.first_order import adjoint_of
 
 LEAST = 1e-10  # alpha that a mean depth is divided by
 ALPHA_MAX = 0.999  # to which gsplat clamps an opacity at a pixel
@@ -30,7 +30,7 @@ class _Magnitudes(torch.autograd.Function):
         return image.clone(), others.clone(), depth.clone(), alpha.clone()
 
     @staticmethod
-    @once_differentiable
+    @adjoint_of("magnitudes")
     def backward(ctx, adj_image, adj_others, adj_depth, adj_alpha):
         channels, background = ctx.saved_tensors
         adj_alpha_alone = adj_alpha - (adj_image * background).sum(-1, keepdim=True)

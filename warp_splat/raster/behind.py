@@ -5,7 +5,6 @@ import functools
 import numpy as np
 import torch
 import warp as wp
-from torch.autograd.function import once_differentiable
 
 from warp_splat.camera import Camera
 from warp_splat.kernels.environment import RUN, make_adj_put_behind, make_put_behind
@@ -14,6 +13,7 @@ from warp_splat.lenses import Lens
 from warp_splat.lenses.shutter import Shutter, rotated
 from warp_splat.raster.camera_parameters import CameraParameters
 from warp_splat.raster.drivers import driver_of
+from warp_splat.runtime.first_order import adjoint_of
 from warp_splat.runtime.launch import launch_in_lanes, send, view
 from warp_splat.runtime.sums import in_pairs
 from warp_splat.runtime.timers import stage
@@ -80,11 +80,10 @@ class _PutBehind(torch.autograd.Function):
         return made
 
     @staticmethod
-    @once_differentiable
+    @adjoint_of("environment")
     def backward(ctx, adj):
-        with stage("adjoint of environment"):
-            alpha, rays, behind = ctx.saved_tensors
-            adj, adj_alpha, lanes = adj.contiguous(), torch.empty_like(alpha), driver_of(alpha.device).lanes
-            inputs = [ctx.rotation, rays, alpha.view(-1), behind.view(-1, 3), adj.view(-1, 3)]
-            sums = launch_in_lanes(make_adj_put_behind, lanes, inputs, [adj_alpha.view(-1)], run=RUN, sums=48)
-            return adj, adj_alpha, in_pairs(sums).to(adj).view(-1, 3).nan_to_num(0.0, 0.0, 0.0), None, None
+        alpha, rays, behind = ctx.saved_tensors
+        adj, adj_alpha, lanes = adj.contiguous(), torch.empty_like(alpha), driver_of(alpha.device).lanes
+        inputs = [ctx.rotation, rays, alpha.view(-1), behind.view(-1, 3), adj.view(-1, 3)]
+        sums = launch_in_lanes(make_adj_put_behind, lanes, inputs, [adj_alpha.view(-1)], run=RUN, sums=48)
+        return adj, adj_alpha, in_pairs(sums).to(adj).view(-1, 3).nan_to_num(0.0, 0.0, 0.0), None, None

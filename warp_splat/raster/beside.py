@@ -9,7 +9,6 @@ from typing import NamedTuple
 
 import torch
 import warp as wp
-from torch.autograd.function import once_differentiable
 
 from warp_splat.camera import Camera
 from warp_splat.kernels.slots import CHANNEL
@@ -18,8 +17,8 @@ from warp_splat.raster.camera_parameters import CameraParameters
 from warp_splat.raster.data import LESS, Bins, Gaussians, Splats2D, variant_of
 from warp_splat.raster.drivers import Driver
 from warp_splat.raster.seam import Crossing, with_copies
+from warp_splat.runtime.first_order import adjoint_of
 from warp_splat.runtime.launch import check_memory
-from warp_splat.runtime.timers import stage
 
 WIDTHS = (4, 16, 32)  # columns of a slot that channels take: as many kernels sum them up
 MANY = 2**28  # bytes of a group's gradients from which on it is asked whether there is room for them
@@ -162,17 +161,16 @@ class Channels(torch.autograd.Function):
         return image
 
     @staticmethod
-    @once_differentiable
+    @adjoint_of("channels")
     def backward(ctx, adj_image):
-        with stage("adjoint of channels"):
-            (features,) = ctx.saved_tensors
-            adj_image = _without_bad(adj_image, ctx.blending)
-            adj_features = torch.empty_like(features)
-            total: list[torch.Tensor] = []
-            for group in _groups(ctx.blending.bins, features, ctx.blending.driver):
-                geometry, part = _differentiate(ctx.blending, group, adj_image)
-                adj_features[:, group.begin : group.begin + group.count] = part
-                total = [a.add_(b) for a, b in zip(total, geometry, strict=True)] if total else geometry
+        (features,) = ctx.saved_tensors
+        adj_image = _without_bad(adj_image, ctx.blending)
+        adj_features = torch.empty_like(features)
+        total: list[torch.Tensor] = []
+        for group in _groups(ctx.blending.bins, features, ctx.blending.driver):
+            geometry, part = _differentiate(ctx.blending, group, adj_image)
+            adj_features[:, group.begin : group.begin + group.count] = part
+            total = [a.add_(b) for a, b in zip(total, geometry, strict=True)] if total else geometry
         return *total, adj_features, None
 
 
@@ -186,12 +184,11 @@ class Weights(torch.autograd.Function):
         return weights.clone()
 
     @staticmethod
-    @once_differentiable
+    @adjoint_of("channels")
     def backward(ctx, adj_weights):
-        with stage("adjoint of channels"):
-            (ranks,) = ctx.saved_tensors
-            group = Group(0, ranks.shape[2], adj_weights.new_empty(0, 0))
-            geometry, _ = _differentiate(ctx.blending, group, _without_bad(adj_weights, ctx.blending), ranks)
+        (ranks,) = ctx.saved_tensors
+        group = Group(0, ranks.shape[2], adj_weights.new_empty(0, 0))
+        geometry, _ = _differentiate(ctx.blending, group, _without_bad(adj_weights, ctx.blending), ranks)
         return *geometry, None, None, None
 
 

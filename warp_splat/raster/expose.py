@@ -1,14 +1,13 @@
 """How a camera shows an image: a map of its colors and how its lens darkens it, differentiable in torch."""
 
 import torch
-from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
 from warp_splat.kernels.color_map import make_adj_map_colors, make_map_colors, vec12
 from warp_splat.raster.drivers import driver_of
+from warp_splat.runtime.first_order import adjoint_of
 from warp_splat.runtime.launch import launch_in_lanes, view
 from warp_splat.runtime.sums import in_pairs
-from warp_splat.runtime.timers import stage
 
 
 def expose(
@@ -70,14 +69,13 @@ class _ColorMap(torch.autograd.Function):
         return mapped
 
     @staticmethod
-    @once_differentiable
+    @adjoint_of("exposure")
     def backward(ctx, adj):
-        with stage("adjoint of exposure"):
-            image, numbers = ctx.saved_tensors
-            adj_image, lanes = torch.empty_like(image), driver_of(image.device).lanes
-            inputs = [view(numbers.view(1, 12), vec12), image.view(-1, 3), adj.contiguous().view(-1, 3)]
-            sums = launch_in_lanes(make_adj_map_colors, lanes, inputs, [adj_image.view(-1, 3)], sums=12)
-            return adj_image, in_pairs(sums).to(numbers.dtype).nan_to_num(0.0, 0.0, 0.0)
+        image, numbers = ctx.saved_tensors
+        adj_image, lanes = torch.empty_like(image), driver_of(image.device).lanes
+        inputs = [view(numbers.view(1, 12), vec12), image.view(-1, 3), adj.contiguous().view(-1, 3)]
+        sums = launch_in_lanes(make_adj_map_colors, lanes, inputs, [adj_image.view(-1, 3)], sums=12)
+        return adj_image, in_pairs(sums).to(numbers.dtype).nan_to_num(0.0, 0.0, 0.0)
 
 
 class _Spread(torch.autograd.Function):
@@ -88,6 +86,6 @@ class _Spread(torch.autograd.Function):
         return numbers.detach()[:, None, None].expand(-1, *size)
 
     @staticmethod
-    @once_differentiable
+    @adjoint_of("numbers")
     def backward(ctx, adj):
         return in_pairs(adj.flatten(1).T).to(adj.dtype).nan_to_num(0.0, 0.0, 0.0), None

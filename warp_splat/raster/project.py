@@ -9,7 +9,6 @@ from typing import NamedTuple
 import numpy as np
 import torch
 import warp as wp
-from torch.autograd.function import once_differentiable
 
 from warp_splat.camera import Camera
 from warp_splat.config import FRUSTUM_MARGIN, RasterOptions
@@ -28,9 +27,9 @@ from warp_splat.raster import camera_parameters as cameras
 from warp_splat.raster.camera_parameters import CameraParameters
 from warp_splat.raster.data import Dropped, Gaussians, Splats2D, falloff_of, plus
 from warp_splat.raster.drivers import Driver, driver_of
+from warp_splat.runtime.first_order import adjoint_of
 from warp_splat.runtime.launch import bind, filled_up, grouped, launch, pack_struct
 from warp_splat.runtime.pool import even_slices, slice_by_slice
-from warp_splat.runtime.timers import stage
 
 Tensors = Sequence[torch.Tensor]
 Pass = Callable[[int, int], object]  # over groups of Gaussians
@@ -212,66 +211,65 @@ class Project(torch.autograd.Function):
         return tuple(splats)
 
     @staticmethod
-    @once_differentiable
+    @adjoint_of("project")
     def backward(ctx, *adj_outputs):
-        with stage("adjoint of project"):
-            it: Projecting = ctx.it
-            *saved, twist, intrinsics, last_twist, coefficients = ctx.saved_tensors  # once: checkpoints forbid more
-            given = Gaussians(*saved[: len(Gaussians._fields)])
-            splats = Splats2D(*saved[len(given) :])
-            wants_twist, wants_intrinsics, wants_last = ctx.needs_input_grad[len(given) : len(given) + 3]
-            wants_pose = wants_twist or wants_last
-            adj_splats = [
-                torch.zeros_like(found) if adj is None else adj.contiguous().resolve_neg()
-                for found, adj in zip(splats[:5], adj_outputs[:5], strict=True)
-            ]
-            adj_splats = Splats2D(*adj_splats, splats.extents, splats.radii)
-            lanes, count, device = it.driver.lanes, len(given.means), given.means.device
-            rest = given.sh_rest
-            adj_means, adj_dc, adj_rest = (torch.empty_like(tensor) for tensor in (given.means, given.sh_dc, rest))
-            colored = [splats.radii, splats.colors, adj_splats.colors]
-            inputs = [it.cam, given.means, _harmonics(given.sh_dc, rest), *colored]
-            shade = bind(make_adj_shade(lanes), inputs, [adj_means, _harmonics(adj_dc, adj_rest)], device)
-            if lanes == 1 and rest.shape[1] > 0:
-                inputs = [it.cam, given.means, *colored]
-                launch(make_adj_rest(), adj_rest[..., 0].numel(), inputs, [adj_rest], device=device)
-            shapes = [torch.empty_like(tensor) for tensor in (given.quats, given.scales, given.opacities)]
-            adj = Gaussians(adj_means, *shapes, adj_dc, adj_rest)
-            adj_placed = torch.zeros_like(adj_means) if wants_pose else adj_means  # else added to the colors' part
-            outputs, adj_outputs = _geometry(splats), _geometry(adj_splats)
-            geometry, shared = _geometry_of(it, given[:4], outputs, [adj_placed, *shapes], adj_outputs)
-            totals: list[float] = []
+        it: Projecting = ctx.it
+        *saved, twist, intrinsics, last_twist, coefficients = ctx.saved_tensors  # once: checkpoints forbid more
+        given = Gaussians(*saved[: len(Gaussians._fields)])
+        splats = Splats2D(*saved[len(given) :])
+        wants_twist, wants_intrinsics, wants_last = ctx.needs_input_grad[len(given) : len(given) + 3]
+        wants_pose = wants_twist or wants_last
+        adj_splats = [
+            torch.zeros_like(found) if adj is None else adj.contiguous().resolve_neg()
+            for found, adj in zip(splats[:5], adj_outputs[:5], strict=True)
+        ]
+        adj_splats = Splats2D(*adj_splats, splats.extents, splats.radii)
+        lanes, count, device = it.driver.lanes, len(given.means), given.means.device
+        rest = given.sh_rest
+        adj_means, adj_dc, adj_rest = (torch.empty_like(tensor) for tensor in (given.means, given.sh_dc, rest))
+        colored = [splats.radii, splats.colors, adj_splats.colors]
+        inputs = [it.cam, given.means, _harmonics(given.sh_dc, rest), *colored]
+        shade = bind(make_adj_shade(lanes), inputs, [adj_means, _harmonics(adj_dc, adj_rest)], device)
+        if lanes == 1 and rest.shape[1] > 0:
+            inputs = [it.cam, given.means, *colored]
+            launch(make_adj_rest(), adj_rest[..., 0].numel(), inputs, [adj_rest], device=device)
+        shapes = [torch.empty_like(tensor) for tensor in (given.quats, given.scales, given.opacities)]
+        adj = Gaussians(adj_means, *shapes, adj_dc, adj_rest)
+        adj_placed = torch.zeros_like(adj_means) if wants_pose else adj_means  # else added to the colors' part
+        outputs, adj_outputs = _geometry(splats), _geometry(adj_splats)
+        geometry, shared = _geometry_of(it, given[:4], outputs, [adj_placed, *shapes], adj_outputs)
+        totals: list[float] = []
 
-            def total(low: int, high: int) -> None:
-                rows = slice(lanes * low, lanes * high)
-                if wants_pose:
-                    adj_means[rows] += adj_placed[rows]
-                if it.driver.peeks:
-                    totals.extend(float(tensor[rows].sum()) for tensor in adj[:5])
-
-            groups = even_slices(-(-count // lanes), each=lanes, device=device)
-            slice_by_slice([shade, _clear(shapes, lanes), geometry, total], groups)
-            adj_twist = adj_intrinsics = adj_last = adj_coefficients = None
-            peeks = it.driver.peeks or it.camera.shutter is not None  # whose motion the host has looked at
-            adj_motion = cameras.motion_gradient(None if it.bend else shared, lanes, wants_pose or wants_intrinsics)
+        def total(low: int, high: int) -> None:
+            rows = slice(lanes * low, lanes * high)
             if wants_pose:
-                inputs = [it.cam, given.means, given.quats, adj_means, adj_placed, adj.quats]
-                sums = cameras.sums_of(make_adj_pose, lanes, 6, inputs)
-                by_twist = partial(cameras.twist_gradient, it.camera, it.here, adj_motion)
-                adj_twist = cameras.of_sums(partial(by_twist, 0), sums, peeks, twist) if wants_twist else None
-                adj_last = cameras.of_sums(partial(by_twist, 1), sums, peeks, last_twist) if wants_last else None
-            if wants_intrinsics:
-                inputs = [it.cam, given.opacities, *splats[:3], *adj_splats[:3]]  # opacities before antialiasing
-                sums = cameras.sums_of(make_adj_intrinsics, lanes, 4, inputs)
-                by_intrinsics = partial(cameras.intrinsics_gradient, it.camera, adj_motion[:, 3])
-                adj_intrinsics = cameras.of_sums(by_intrinsics, sums, peeks, intrinsics)
-            if it.bend:
-                adj_coefficients = cameras.coefficients_gradient(it.camera.lens, shared, coefficients)
-            # a GPU would have to stop for the answer; sh_rest's are multiples of those of sh_dc
-            if not (it.driver.peeks and math.isfinite(sum(totals))):
-                bad = torch.zeros_like(splats.radii)
-                launch(quarantine, count, [splats.radii], [*adj, bad], device=device)
-                it.dropped.gaussian_count = plus(it.dropped.gaussian_count, torch.count_nonzero(bad))
+                adj_means[rows] += adj_placed[rows]
+            if it.driver.peeks:
+                totals.extend(float(tensor[rows].sum()) for tensor in adj[:5])
+
+        groups = even_slices(-(-count // lanes), each=lanes, device=device)
+        slice_by_slice([shade, _clear(shapes, lanes), geometry, total], groups)
+        adj_twist = adj_intrinsics = adj_last = adj_coefficients = None
+        peeks = it.driver.peeks or it.camera.shutter is not None  # whose motion the host has looked at
+        adj_motion = cameras.motion_gradient(None if it.bend else shared, lanes, wants_pose or wants_intrinsics)
+        if wants_pose:
+            inputs = [it.cam, given.means, given.quats, adj_means, adj_placed, adj.quats]
+            sums = cameras.sums_of(make_adj_pose, lanes, 6, inputs)
+            by_twist = partial(cameras.twist_gradient, it.camera, it.here, adj_motion)
+            adj_twist = cameras.of_sums(partial(by_twist, 0), sums, peeks, twist) if wants_twist else None
+            adj_last = cameras.of_sums(partial(by_twist, 1), sums, peeks, last_twist) if wants_last else None
+        if wants_intrinsics:
+            inputs = [it.cam, given.opacities, *splats[:3], *adj_splats[:3]]  # opacities before antialiasing
+            sums = cameras.sums_of(make_adj_intrinsics, lanes, 4, inputs)
+            by_intrinsics = partial(cameras.intrinsics_gradient, it.camera, adj_motion[:, 3])
+            adj_intrinsics = cameras.of_sums(by_intrinsics, sums, peeks, intrinsics)
+        if it.bend:
+            adj_coefficients = cameras.coefficients_gradient(it.camera.lens, shared, coefficients)
+        # a GPU would have to stop for the answer; sh_rest's are multiples of those of sh_dc
+        if not (it.driver.peeks and math.isfinite(sum(totals))):
+            bad = torch.zeros_like(splats.radii)
+            launch(quarantine, count, [splats.radii], [*adj, bad], device=device)
+            it.dropped.gaussian_count = plus(it.dropped.gaussian_count, torch.count_nonzero(bad))
         wanted = zip(adj, ctx.needs_input_grad[: len(adj)], strict=True)
         learned = adj_twist, adj_intrinsics, adj_last, adj_coefficients
         return *(tensor if wants else None for tensor, wants in wanted), *learned, None

@@ -7,7 +7,6 @@ from numbers import Real
 import numpy as np
 import torch
 import warp as wp
-from torch.autograd.function import once_differentiable
 
 from warp_splat.color import to_srgb
 from warp_splat.errors import InputError
@@ -16,6 +15,7 @@ from warp_splat.kernels.cuda.comparison import BAND, STRIP, PicturesView, adj_co
 from warp_splat.kernels.simd import LANES, vec16
 from warp_splat.kernels.window import CHANNELS, MOMENTS, RADIUS, RING, ROWS, SLOPES, WEIGHTS, WINDOW
 from warp_splat.raster.drivers import DRIVERS, driver_of
+from warp_splat.runtime.first_order import adjoint_of
 from warp_splat.runtime.launch import launch, launch_blocks, pack_struct, view
 from warp_splat.runtime.pool import even_slices
 from warp_splat.runtime.timers import stage
@@ -111,19 +111,18 @@ class ImageLoss(torch.autograd.Function):
             return image.new_tensor((1.0 - lambda_dssim) * l1 + lambda_dssim * (1.0 - similarity))
 
     @staticmethod
-    @once_differentiable
+    @adjoint_of("loss")
     def backward(ctx, adj_loss):
-        with stage("adjoint of loss"):
-            image, target, slopes = ctx.saved_tensors
-            height, groups = len(image), slopes.shape[2] - 2
-            bounds, bands = _bands(height)
-            ring, blurred = (_lanes(bands, rows, groups, SLOPES) for rows in (RING, ROWS))
-            adj, scale = torch.empty_like(image), adj_loss.item() / image.numel()
-            weights = [scale * (1.0 - ctx.lambda_dssim), -scale * ctx.lambda_dssim]
-            pictures = _pictures(image, ctx.limits, target, ctx.centers)
-            inputs, outputs = [bounds, pictures, slopes, *weights], [ring, blurred, adj, _taps(adj)]
-            launch(ssim.adj_compare, bands, inputs, outputs, bounds=list(range(bands + 1)))
-            return adj.view(height, -1, CHANNELS), None, None, None
+        image, target, slopes = ctx.saved_tensors
+        height, groups = len(image), slopes.shape[2] - 2
+        bounds, bands = _bands(height)
+        ring, blurred = (_lanes(bands, rows, groups, SLOPES) for rows in (RING, ROWS))
+        adj, scale = torch.empty_like(image), adj_loss.item() / image.numel()
+        weights = [scale * (1.0 - ctx.lambda_dssim), -scale * ctx.lambda_dssim]
+        pictures = _pictures(image, ctx.limits, target, ctx.centers)
+        inputs, outputs = [bounds, pictures, slopes, *weights], [ring, blurred, adj, _taps(adj)]
+        launch(ssim.adj_compare, bands, inputs, outputs, bounds=list(range(bands + 1)))
+        return adj.view(height, -1, CHANNELS), None, None, None
 
 
 class LossInBlocks(torch.autograd.Function):
@@ -143,13 +142,12 @@ class LossInBlocks(torch.autograd.Function):
             return sums.sum()
 
     @staticmethod
-    @once_differentiable
+    @adjoint_of("loss")
     def backward(ctx, adj_loss):
-        with stage("adjoint of loss"):
-            adj = torch.empty_like(ctx.pictures[0])
-            inputs = [_dense(*ctx.pictures), ctx.weights, ctx.slopes, adj_loss.reshape(1)]
-            launch_blocks(adj_compare_block, ctx.blocks, inputs, [adj], adj.device)
-            return adj.view(len(adj), -1, 3), None, None, None
+        adj = torch.empty_like(ctx.pictures[0])
+        inputs = [_dense(*ctx.pictures), ctx.weights, ctx.slopes, adj_loss.reshape(1)]
+        launch_blocks(adj_compare_block, ctx.blocks, inputs, [adj], adj.device)
+        return adj.view(len(adj), -1, 3), None, None, None
 
 
 def _lanes(*shape: int) -> torch.Tensor:

@@ -83,7 +83,7 @@ class Optimizer:
         folder: where the Gaussians' parameters and moments live, in files; without it, in memory.
 
     Raises:
-        InputError: if a leaf of a part is not dense float32.
+        InputError: if a leaf of a part is not dense float32, or a scalar.
     """
 
     def __init__(
@@ -100,8 +100,8 @@ class Optimizer:
         self.model, self.options, self.extent, self.scale = model, options, extent, math.sqrt(batch)
         self.batch, self.parts = batch, {group["name"]: group["params"][0] for group in parts}
         for name, leaf in self.parts.items():
-            if leaf.dtype != torch.float32 or not leaf.is_contiguous():
-                raise InputError(f"parameters of a part: expected dense float32, got {name} of {leaf.dtype}.")
+            if leaf.dtype != torch.float32 or not leaf.is_contiguous() or leaf.dim() == 0:
+                raise InputError(f"parameters of a part: expected dense float32 [N, ...], got {name} of {leaf.dtype}.")
         self.tables = {name: Table(leaf) for name, leaf in model.parameters.items()}
         if folder:
             self.arrange(lambda rows: rows)  # into files

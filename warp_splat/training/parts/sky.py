@@ -43,12 +43,9 @@ class Sky:
         return Verdict(share >= NEEDED, f"{figure} (limit {100 * NEEDED} %)")
 
     def parameters(self) -> list[dict]:
-        """The coefficients."""
-        return [{"name": "sky", "params": [self.harmonics], "lr": self._rate}]
-
-    def _rate(self, iteration: int) -> float:
-        """Log-linear down to LAST_RATE of it."""
-        return self.options.sky_lr * power(LAST_RATE, min(iteration, self.iterations), self.iterations)
+        """The coefficients; their rate falls log-linearly to LAST_RATE of it."""
+        rate = lambda i: self.options.sky_lr * power(LAST_RATE, min(i, self.iterations), self.iterations)  # noqa: E731
+        return [{"name": "sky", "params": [self.harmonics], "lr": rate}]
 
     def load(self) -> None:
         """Compile and load the kernels."""
