@@ -228,14 +228,17 @@ IN_DEBUG_MODE = """
 import sys, warp
 sys.path += ["tests", "benchmarks"]
 import test_threads
-warp.config.mode, test_threads.pool.SMALLEST_SLICE = "debug", 256
+warp.config.mode, warp.config.enable_backward, test_threads.pool.SMALLEST_SLICE = "debug", False, 256
 print(test_threads.state_after_steps())
 """
 
 
 @pytest.mark.slow
 def test_in_debug_mode_warp_finds_no_index_out_of_bounds_and_no_byte_changes():
-    """There, a process ends at the first such index, and threads of ours would meet in Warp's own memory."""
+    """There, a process ends at the first such index, and threads of ours would meet in Warp's own memory.
+
+    Where a program wants no adjoints of its own kernels (``enable_backward``), ours have them.
+    """
     assert python("-c", IN_DEBUG_MODE).stdout.split()[-1] == state_after_steps()
 
 

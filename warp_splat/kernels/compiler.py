@@ -33,7 +33,7 @@ PORTABLE = _portable == "1"
 #: since for each set of them, in each process, Warp compiles its headers first, which takes about 2 s.
 _FLAGS = f"{TARGET} -ffp-contract=off -fno-signed-zeros -mstackrealign -mprefer-vector-width=512 -fno-vectorize"
 
-DIFFERENTIABLE = {"optimization_level": 3, "cpu_compiler_flags": _FLAGS}
+DIFFERENTIABLE = {"optimization_level": 3, "cpu_compiler_flags": _FLAGS, "enable_backward": True}
 
 FORWARD_ONLY = {**DIFFERENTIABLE, "enable_backward": False}
 

@@ -26,7 +26,7 @@ def make_place(coefficients: int) -> wp.Kernel:
     """The Gaussians of shapes that are alike, as cameras see them; each with its color, as a harmonic of degree 0."""
     evaluate = make_harmonics(1).evaluate
 
-    @wp.kernel(module="unique")
+    @wp.kernel(module="unique", enable_backward=True)
     def place(
         first: int,
         places: wp.array[wp.vec4i],  # [P] view, body or -1, shape, and where its Gaussians begin
@@ -77,7 +77,7 @@ def byte_of(value: float, channel: int):
     return wp.uint32(wp.clamp(value, 0.0, 1.0) * 255.0 + 0.5) << wp.uint32(8 * channel)
 
 
-@wp.kernel
+@wp.kernel(enable_backward=True)
 def put_among_meshes(
     first: int,
     image: wp.array3d[wp.vec3],  # [V, H, W] of the Gaussians in front of the meshes, on black
