@@ -10,7 +10,7 @@ import torch
 import warp as wp
 
 from warp_splat.camera import Camera
-from warp_splat.errors import InputError
+from warp_splat.errors import InputError, refusing
 
 OUT_OF_MEMORY = ("out of memory", "not enough memory", "can't allocate memory", "Failed to allocate")
 
@@ -29,6 +29,15 @@ def choose_device(name: str) -> torch.device:
     return torch.device("cpu")
 
 
+#: For what begins to use Warp. Only then does it look for a folder.
+kernels_kept = refusing(
+    OSError,
+    "WARP_CACHE_PATH, or .cache in the home folder: expected a folder for compiled kernels, with room",
+    "; make room, or set WARP_CACHE_PATH to a folder that can be written.",
+)
+
+
+@kernels_kept
 def why_no_cuda() -> str | None:
     """What keeps kernels from running on a GPU here, and what to do about it; None if nothing does."""
     if torch.version.cuda is None:

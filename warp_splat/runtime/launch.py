@@ -23,7 +23,7 @@ import warp as wp
 
 from warp_splat.errors import InputError
 from warp_splat.kernels.compiler import once
-from warp_splat.runtime.devices import choose_device
+from warp_splat.runtime.devices import choose_device, kernels_kept
 from warp_splat.runtime.pool import even_slices, in_slices, set_threads
 
 #: Else Warp leaves assembling to newer drivers; benchmarks/cubins.py looks at what its own assembler makes.
@@ -268,6 +268,7 @@ def grouped(kernel: wp.Kernel, values: Sequence, begin: int = 1) -> list:
 
 
 @once
+@kernels_kept
 def load(device: torch.device | str, *kernels: wp.Kernel) -> None:
     """Compile and load ``kernels``, and what else is in their modules."""
     wp.init()

@@ -77,6 +77,7 @@ def resolve(config: TrainConfig, processes: Processes) -> tuple[TrainConfig, Che
         from warp_splat.sfm.command import scene_for  # noqa: PLC0415 - only photographs without cameras need it
 
         options = {"seed": config.learn.seed % 2**31, "keep_lens": data.lens == "native"}
+        check_folder(config.changed(source_path=str(scene_of(Path(source)))), folder)
         source = scene_for(source, processes.count, threads=machine.threads, quiet=quiet, **options)
     more = -(iterations - done) % processes.images  # whole steps
     if more and not config.learn.minutes:

@@ -47,7 +47,7 @@ def zeros_in_file(folder: Path, shape: Sequence[int], dtype: torch.dtype) -> tor
         InputError: if there is no room for it.
     """
     size = dtype.itemsize * math.prod(shape)
-    problem = f"{folder}: expected {size / 2**20:.0f} MiB more on its disk for --out_of_core"
+    problem = f"{folder}: expected {math.ceil(size / 2**20)} MiB more on its disk for --out_of_core"
     advice = "; free some, or choose another folder with -m."
     with refusing(OSError, problem, advice), tempfile.TemporaryFile(dir=folder) as file:
         if hasattr(os, "posix_fallocate"):  # a page without room on the disk would end the process

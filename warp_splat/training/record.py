@@ -168,7 +168,14 @@ def how_to_continue(folder: Path, processes: Processes) -> str:
 def finish(trainer: Trainer, run: Run, say: Report) -> None:
     """Pictures, curves and numbers of the saved model, and where they lie."""
     assert run.saved
-    wall = time.perf_counter() - run.start
+    wall, speed = (
+        time.perf_counter() - run.start,
+        run.seconds and run.iteration / run.seconds,
+    )  # a clock may stand still
+    for later in filter(lambda saved: saved > run.iteration, model_folder.saved_iterations(run.folder)):
+        place = model_folder.ply_path(run.folder, later).parent
+        kept = place.rename(place.with_name(f"{place.name}.{place.stat().st_mtime_ns}"))
+        say(f"Warning: {place} was of a run before this, and later; as the newest is drawn, it is {kept.name} now.")
     with run.saved.open("rb") as file:
         run.sha256 = hashlib.file_digest(file, "sha256").hexdigest()
     split, views = trainer.scene.evaluated
@@ -186,7 +193,7 @@ def finish(trainer: Trainer, run: Run, say: Report) -> None:
         "gaussians": run.gaussians,
         "sha256": run.sha256,
         "seconds": round(wall, 2),
-        "iterations_per_second": round(run.iteration / run.seconds, 2),
+        "iterations_per_second": round(speed, 2),
         "spent": round(run.spent, 2),
         "processes": trainer.processes.count,
         "peak_memory_mb": peak_memory(),
@@ -210,7 +217,7 @@ def finish(trainer: Trainer, run: Run, say: Report) -> None:
             names["profile"] = "profile.png"
     finally:  # what was measured and written is told, even if the disk is full
         print(
-            f"{state} after {run.iteration} iterations, {wall:.0f} s ({run.iteration / run.seconds:.1f} it/s): "
+            f"{state} after {run.iteration} iterations, {wall:.0f} s ({speed:.1f} it/s): "
             f"{split} {metrics_line(means)}, {run.gaussians} Gaussians"
         )
         for what, name in names.items():
