@@ -17,8 +17,8 @@ from warp_splat.kernels.harmonics import C0
 from warp_splat.raster.data import Gaussians
 from warp_splat.raster.drivers import driver_of
 from warp_splat.runtime.distributed import ALONE, Processes
-from warp_splat.runtime.first_order import adjoint_of
 from warp_splat.runtime.launch import launch_in_lanes
+from warp_splat.runtime.timers import adjoint_of
 
 INITIAL_OPACITY = 0.1
 CHUNK = 2**16  # Gaussians that are taken at once, where all together would take much memory

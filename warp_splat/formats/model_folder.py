@@ -116,12 +116,6 @@ def ply_path(folder: str | Path, iteration: int) -> Path:
     return Path(folder) / "point_cloud" / f"iteration_{iteration}" / "point_cloud.ply"
 
 
-def saved_iterations(folder: str | Path) -> list[int]:
-    """Iterations of which a model folder has the model, ascending."""
-    names = (path.name.removeprefix("iteration_") for path in (Path(folder) / "point_cloud").glob("iteration_*"))
-    return sorted({int(name) for name in names if name.isdecimal() and ply_path(folder, int(name)).is_file()})
-
-
 def find_iteration(folder: str | Path, iteration: int = -1) -> int:
     """The iteration to load: the one asked for, or the largest saved one for -1.
 
@@ -130,7 +124,9 @@ def find_iteration(folder: str | Path, iteration: int = -1) -> int:
     """
     if not Path(folder).is_dir():
         raise InputError(f"{folder}: expected the folder of a trained model, found no such folder; check the path.")
-    if not (saved := saved_iterations(folder)):
+    names = (path.name.removeprefix("iteration_") for path in (Path(folder) / "point_cloud").glob("iteration_*"))
+    saved = sorted({int(name) for name in names if name.isdecimal() and ply_path(folder, int(name)).is_file()})
+    if not saved:
         raise InputError(f"{folder}: expected point_cloud/iteration_*/*.ply, found none; is it a model folder?")
     if iteration == -1:
         return saved[-1]

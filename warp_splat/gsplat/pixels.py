@@ -11,7 +11,7 @@ from warp_splat.raster.beside import absolute_gradients, blend_channels
 from warp_splat.raster.blend import Blending, blend
 from warp_splat.raster.data import Bins, Splats2D
 from warp_splat.raster.drivers import driver_of
-from warp_splat.runtime.first_order import adjoint_of
+from warp_splat.runtime.timers import adjoint_of
 
 LEAST = 1e-10  # alpha that a mean depth is divided by
 ALPHA_MAX = 0.999  # to which gsplat clamps an opacity at a pixel

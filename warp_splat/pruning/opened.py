@@ -1,7 +1,7 @@
 """What simplify and clean begin and end with: a model opened with its scene, a file written, in numbers."""
 
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -52,7 +52,7 @@ class Opened(Finished):
             self.scene = replace(self.scene, test=[view for view in self.scene.test if view.name not in found])
         self.shows = self._crop(config.crop, used) if config.crop else None
         if self.shows:
-            train, test = (within_sight(views, self.shows) for views in (self.scene.train, self.scene.test))
+            train, test = (list(within_sight(views, self.shows)) for views in (self.scene.train, self.scene.test))
             if not train:
                 raise InputError("--crop: expected Gaussians that cover pixels of photographs, found none; enlarge it.")
             print(f"Only what the Gaussians in the box cover counts, in {len(train)} of {len(self.scene.train)} views.")
@@ -89,17 +89,15 @@ class Opened(Finished):
         return found[0]
 
 
-def within_sight(views: list[View], shows: Callable[[Camera], torch.Tensor]) -> list[View]:
+def within_sight(views: list[View], shows: Callable[[Camera], torch.Tensor]) -> Iterator[View]:
     """The views, of which only counts what Gaussians cover: photographs show what a crop left out, too."""
-    found = []
     for view in views:
         counts = shows(view.camera).cpu().numpy()
         if view.mask is not None:
             counts &= view.mask > 0
         if counts.any():
             read = partial(lambda view, mask: view.pixels._replace(mask=mask), view, counts.astype(np.uint8))
-            found.append(replace(view, photograph=Stored(read, view.linear, alpha=True, mask=True)))
-    return found
+            yield replace(view, photograph=Stored(read, view.linear, alpha=True, mask=True))
 
 
 def require_some(finished: Finished) -> None:

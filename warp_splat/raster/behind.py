@@ -13,10 +13,9 @@ from warp_splat.lenses import Lens
 from warp_splat.lenses.shutter import Shutter, rotated
 from warp_splat.raster.camera_parameters import CameraParameters
 from warp_splat.raster.drivers import driver_of
-from warp_splat.runtime.first_order import adjoint_of
 from warp_splat.runtime.launch import launch_in_lanes, send, view
 from warp_splat.runtime.sums import in_pairs
-from warp_splat.runtime.timers import stage
+from warp_splat.runtime.timers import adjoint_of, stage
 
 KEPT = 4  # pictures, by size and lens, whose rays are kept
 

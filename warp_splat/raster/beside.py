@@ -17,8 +17,8 @@ from warp_splat.raster.camera_parameters import CameraParameters
 from warp_splat.raster.data import LESS, Bins, Gaussians, Splats2D, variant_of
 from warp_splat.raster.drivers import Driver
 from warp_splat.raster.seam import Crossing, with_copies
-from warp_splat.runtime.first_order import adjoint_of
 from warp_splat.runtime.launch import check_memory
+from warp_splat.runtime.timers import adjoint_of
 
 WIDTHS = (4, 16, 32)  # columns of a slot that channels take: as many kernels sum them up
 MANY = 2**28  # bytes of a group's gradients from which on it is asked whether there is room for them

@@ -9,7 +9,7 @@ from warp_splat.config import RasterOptions
 from warp_splat.errors import InputError
 from warp_splat.raster.data import Bins, Dropped, Pixels, Saved, Splats2D, alphas_of, plus
 from warp_splat.raster.drivers import Driver
-from warp_splat.runtime.first_order import adjoint_of
+from warp_splat.runtime.timers import adjoint_of
 
 
 @dataclass
@@ -69,9 +69,8 @@ class Blend(torch.autograd.Function):
         (background, *saved), it = ctx.saved_tensors, ctx.blending
         given = zip(adj_pixels, ctx.nothing, strict=True)
         adj_pixels = Pixels(*(zero if adj is None else adj.contiguous().resolve_neg() for adj, zero in given))
-        slots, adj_background, dropped = it.driver.adjoint(
-            it.adjoint, it.bins, it.options, background, Saved(*saved), adj_pixels
-        )
+        found = it.driver.adjoint(it.adjoint, it.bins, it.options, background, Saved(*saved), adj_pixels)
+        slots, adj_background, dropped = found
         it.dropped.pixel_count = plus(it.dropped.pixel_count, dropped.sum())
         grads = it.driver.gather(it.bins, slots)
         return *grads, adj_background, None

@@ -5,9 +5,9 @@ from torch.nn import functional
 
 from warp_splat.kernels.color_map import make_adj_map_colors, make_map_colors, vec12
 from warp_splat.raster.drivers import driver_of
-from warp_splat.runtime.first_order import adjoint_of
 from warp_splat.runtime.launch import launch_in_lanes, view
 from warp_splat.runtime.sums import in_pairs
+from warp_splat.runtime.timers import adjoint_of
 
 
 def expose(

@@ -27,9 +27,9 @@ from warp_splat.raster import camera_parameters as cameras
 from warp_splat.raster.camera_parameters import CameraParameters
 from warp_splat.raster.data import Dropped, Gaussians, Splats2D, falloff_of, plus
 from warp_splat.raster.drivers import Driver, driver_of
-from warp_splat.runtime.first_order import adjoint_of
 from warp_splat.runtime.launch import bind, filled_up, grouped, launch, pack_struct
 from warp_splat.runtime.pool import even_slices, slice_by_slice
+from warp_splat.runtime.timers import adjoint_of
 
 Tensors = Sequence[torch.Tensor]
 Pass = Callable[[int, int], object]  # over groups of Gaussians
@@ -219,10 +219,8 @@ class Project(torch.autograd.Function):
         splats = Splats2D(*saved[len(given) :])
         wants_twist, wants_intrinsics, wants_last = ctx.needs_input_grad[len(given) : len(given) + 3]
         wants_pose = wants_twist or wants_last
-        adj_splats = [
-            torch.zeros_like(found) if adj is None else adj.contiguous().resolve_neg()
-            for found, adj in zip(splats[:5], adj_outputs[:5], strict=True)
-        ]
+        pairs = zip(splats[:5], adj_outputs[:5], strict=True)
+        adj_splats = (torch.zeros_like(of) if adj is None else adj.contiguous().resolve_neg() for of, adj in pairs)
         adj_splats = Splats2D(*adj_splats, splats.extents, splats.radii)
         lanes, count, device = it.driver.lanes, len(given.means), given.means.device
         rest = given.sh_rest

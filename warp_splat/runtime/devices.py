@@ -30,11 +30,7 @@ def choose_device(name: str) -> torch.device:
 
 
 #: For what begins to use Warp. Only then does it look for a folder.
-kernels_kept = refusing(
-    OSError,
-    "WARP_CACHE_PATH, or .cache in the home folder: expected a folder for compiled kernels, with room",
-    "; make room, or set WARP_CACHE_PATH to a folder that can be written.",
-)
+kernels_kept = refusing(OSError, "WARP_CACHE_PATH or ~/.cache: expected a folder for compiled kernels", "; name one.")
 
 
 @kernels_kept

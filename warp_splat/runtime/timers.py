@@ -2,10 +2,12 @@
 
 import time
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 import torch
+
+from warp_splat.errors import InputError
 
 _seconds: dict[str, float] | None = None
 
@@ -22,6 +24,24 @@ def stage(name: str) -> Iterator[None]:
     finally:
         if table is not None:
             table[name] += _now() - start
+
+
+def adjoint_of(what: str) -> Callable[[Callable], Callable]:
+    """A stage of its own for a ``backward`` of torch's, and an InputError where a graph of its gradients is wanted.
+
+    Torch's ``once_differentiable`` lets them pass for constants where the loss is linear in the image.
+    """
+
+    def decorate(backward: Callable) -> Callable:
+        def run(ctx, *upstream):
+            if torch.is_grad_enabled():
+                raise InputError("create_graph=True: expected False, as first derivatives have none; take differences.")
+            with stage(f"adjoint of {what}"):
+                return backward(ctx, *upstream)
+
+        return run
+
+    return decorate
 
 
 def _now() -> float:

@@ -15,10 +15,9 @@ from warp_splat.kernels.cuda.comparison import BAND, STRIP, PicturesView, adj_co
 from warp_splat.kernels.simd import LANES, vec16
 from warp_splat.kernels.window import CHANNELS, MOMENTS, RADIUS, RING, ROWS, SLOPES, WEIGHTS, WINDOW
 from warp_splat.raster.drivers import DRIVERS, driver_of
-from warp_splat.runtime.first_order import adjoint_of
 from warp_splat.runtime.launch import launch, launch_blocks, pack_struct, view
 from warp_splat.runtime.pool import even_slices
-from warp_splat.runtime.timers import stage
+from warp_splat.runtime.timers import adjoint_of, stage
 
 LOG_FLOOR = 1e-3  # light below which differences stop to count by their ratio (Mildenhall et al. 2022, RawNeRF)
 #: Under these, light is compared: 0 stays 0 and 1 stays 1, negative counts as black, brighter than 1 goes on.

@@ -172,10 +172,10 @@ def finish(trainer: Trainer, run: Run, say: Report) -> None:
         time.perf_counter() - run.start,
         run.seconds and run.iteration / run.seconds,
     )  # a clock may stand still
-    for later in filter(lambda saved: saved > run.iteration, model_folder.saved_iterations(run.folder)):
-        place = model_folder.ply_path(run.folder, later).parent
-        kept = place.rename(place.with_name(f"{place.name}.{place.stat().st_mtime_ns}"))
-        say(f"Warning: {place} was of a run before this, and later; as the newest is drawn, it is {kept.name} now.")
+    for place in (run.folder / "point_cloud").glob("iteration_*"):
+        if (number := place.name.removeprefix("iteration_")).isdecimal() and int(number) > run.iteration:
+            kept = place.rename(place.with_name(f"{place.name}.{place.stat().st_mtime_ns}"))
+            say(f"Warning: {place} was of a run before this, and later; as the newest is drawn, it is {kept.name} now.")
     with run.saved.open("rb") as file:
         run.sha256 = hashlib.file_digest(file, "sha256").hexdigest()
     split, views = trainer.scene.evaluated

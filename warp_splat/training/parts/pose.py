@@ -93,9 +93,8 @@ class Pose:
     def parameters(self) -> list[dict]:
         """Twists, and lenses if asked for."""
         groups = [{"name": "pose", "params": [self.moves], "lr": self._rate}]
-        if self.options.pose_intrinsics:
-            groups.append({"name": "lens", "params": [self.stretches], "lr": lambda i: LENS_RATE * self._rate(i)})
-        return groups
+        lens = {"name": "lens", "params": [self.stretches], "lr": lambda i: LENS_RATE * self._rate(i)}
+        return groups + [lens] * bool(self.options.pose_intrinsics)
 
     def _rate(self, iteration: int) -> float:
         """0 until there is something to compare with; then it falls."""
