@@ -47,7 +47,7 @@ class Activate(torch.autograd.Function):
         return found
 
     @staticmethod
-    @adjoint_of("activation")
+    @adjoint_of("project")  # with whose stage it counts forward, too
     def backward(ctx, *adj_outputs):
         return _launched(make_adj_activate, *ctx.saved_tensors, *(adj.contiguous() for adj in adj_outputs))
 
@@ -61,7 +61,7 @@ class Taken(torch.autograd.Function):
         return leaf[rows]
 
     @staticmethod
-    @adjoint_of("rows")
+    @adjoint_of("project")
     def backward(ctx, adj_rows):
         known = {"is_coalesced": True, "check_invariants": False}  # indices ascend
         return torch.sparse_coo_tensor(ctx.rows[None], adj_rows, ctx.shape, **known), None
