@@ -148,8 +148,7 @@ def _check_spread(subject: Subject, points: np.ndarray) -> Iterator[Finding]:
     centers = np.array([photo.camera.center for photo in subject.photos])
     middle = np.median(points, axis=0)
     distances = np.linalg.norm(points - middle, axis=1)
-    if np.median(distances) > 0 and distances.max() > FAR * np.median(distances):
-        far = np.count_nonzero(distances > FAR * np.median(distances))
+    if np.median(distances) > 0 and (far := np.count_nonzero(distances > FAR * np.median(distances))):
         yield Finding("points", "warning", f"{far} of {len(points)} points are {FAR:.0f} times as far away as most.")
     spread = np.linalg.norm(centers - centers.mean(axis=0), axis=1).max()
     reach = np.median(np.linalg.norm(points - centers.mean(axis=0), axis=1))
