@@ -239,8 +239,7 @@ def judge(expected: Expected, mode: str) -> Outcome:
     ]
     failures = tuple(statement for holds, statement in statements if not holds)
     counted = count_text(culled=int((out.radii == 0).sum()), invalid=out.invalid, dropped=dropped_now)
-    gradient = errors[worst], expected.gradient_limits[worst]
-    return Outcome(expected.says, value_error, *gradient, counted, failures)
+    return Outcome(expected.says, value_error, errors[worst], expected.gradient_limits[worst], counted, failures)
 
 
 def count_text(**counts: int) -> str:
