@@ -49,14 +49,12 @@ def draw_exactly(
     gaussians: Gaussians, camera: Any, background: torch.Tensor, options: RasterOptions, pixels=None
 ) -> oracle.Render:
     """The oracle's render, of float64."""
-    given = (*gaussians[:4], gaussians.sh, camera, background)
-    return oracle.exact_render(*given, **for_oracle(options), pixels=pixels)
+    return oracle.exact_render(*gaussians[:4], gaussians.sh, camera, background, **for_oracle(options), pixels=pixels)
 
 
 def random_upstream(shape: torch.Size, fragile: torch.Tensor) -> torch.Tensor:
     """A random upstream gradient of an image, float32; 0 at the pixels that hang on a rounding."""
-    weights = torch.randn(shape, generator=torch.Generator().manual_seed(1))
-    return weights.masked_fill(fragile[..., None], 0.0)
+    return torch.randn(shape, generator=torch.Generator().manual_seed(1)).masked_fill(fragile[..., None], 0.0)
 
 
 def compute_truth(workload: Workload) -> Truth:
