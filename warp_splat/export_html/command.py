@@ -127,7 +127,6 @@ def make_page(
     blocks["constants.glsl"] = _constants({"HARMONICS": texels, **options})
     blocks["scene"] = json.dumps(scene, allow_nan=False).replace("<", "\\u003c")
     blocks |= dict(list(parts.items())[:before])
-    rest = dict(list(parts.items())[before:])
     # no module: those wait for the whole page
     script = "\n".join(["(async () => {", '"use strict";', *map(_source, SCRIPTS), "})();"])
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
@@ -138,7 +137,7 @@ def make_page(
         background="#fff" if options["BACKGROUND"] else "#000",
         blocks=_blocks(blocks),
         script=script,
-        rest=_blocks(rest),
+        rest=_blocks(dict(list(parts.items())[before:])),
     )
 
 
