@@ -127,8 +127,7 @@ class Worlds:
         check_count(count := int(ends[-1]), self.camera, len(own.splats), device)
         ranges, instances = torch.stack([ends - lengths, ends], 1).int(), own.instances.new_empty(count)
         slices = balanced_slices(ends.numpy()) if own.slices else []
-        inputs = [back.view(), own.view(), ranges]
-        launch(merge_lists, len(ranges), inputs, [instances], bounds=slices, device=device)
+        launch(merge_lists, len(ranges), [back.view(), own.view(), ranges], [instances], bounds=slices, device=device)
         splats = empty(len(back.splats) + len(own.splats), Splat2D, device)
         wp.copy(splats, back.splats)
         wp.copy(splats, own.splats, len(back.splats))
