@@ -17,7 +17,7 @@ from warp_splat.flags import FOREIGN_FLAGS, check_numbers, default_of, flags_of,
 from warp_splat.presets import EMBEDDED_DEFAULTS, PRESETS
 from warp_splat.runtime.interrupts import ending_as_by_ctrl_c, leaving_at_once
 from warp_splat.text import upward
-from warp_splat.training.options import FIXED_OPTIONS, TrainConfig, check_train
+from warp_splat.training.options import FIXED_BY_PARTS, FIXED_OPTIONS, TrainConfig, check_train
 from warp_splat.training.parts import AUTO, PARTS
 
 #: Of each command: its options, whose docstring says what it does, and its function, loaded when it runs: torch takes
@@ -159,6 +159,8 @@ def _continued(given: dict) -> dict:
     source = given["start_checkpoint"]
     options = load_options(source)
     for name, reason in FIXED_OPTIONS.items():
+        if name in FIXED_BY_PARTS and not (options[name] and FIXED_BY_PARTS[name] in options["parts"].split(",")):
+            continue
         if given.get(name, (kept := options[name])) != kept and os.path.abspath(str(given[name])) != kept:
             kept = "none" if kept == "" else kept
             raise InputError(f"--{name} {given[name]}: expected {kept}, as in {source} ({reason}); leave it out.")

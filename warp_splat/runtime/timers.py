@@ -35,7 +35,7 @@ def adjoint_of(what: str) -> Callable[[Callable], Callable]:
     def decorate(backward: Callable) -> Callable:
         def run(ctx, *upstream):
             if torch.is_grad_enabled():
-                raise InputError("create_graph=True: expected False, as first derivatives have none; take differences.")
+                raise InputError("create_graph=True: expected False: no gradients of gradients here; take differences.")
             with stage(f"adjoint of {what}"):
                 return backward(ctx, *upstream)
 

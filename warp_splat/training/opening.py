@@ -16,7 +16,7 @@ from warp_splat.kernels.compiler import PORTABLE
 from warp_splat.raster.selftest import settle_device
 from warp_splat.runtime import pool
 from warp_splat.runtime.distributed import Processes
-from warp_splat.scene import MASKS, load_scene
+from warp_splat.scene import MASKS, has_cameras, load_scene
 from warp_splat.scene.blocks import BLOCK, COMMON
 from warp_splat.scene.decoding import photo_memory
 from warp_splat.scene.embedded import embedded_scene
@@ -77,7 +77,10 @@ def resolve(config: TrainConfig, processes: Processes) -> tuple[TrainConfig, Che
         from warp_splat.sfm.command import scene_for  # noqa: PLC0415 - only photographs without cameras need it
 
         options = {"seed": config.learn.seed % 2**31, "keep_lens": data.lens == "native"}
-        check_folder(config.changed(source_path=str(scene_of(Path(source)))), folder)
+        if not source:
+            raise InputError("--sfm: expected photographs, found none named; name their folder, or a video, with -s.")
+        if not has_cameras(source):
+            check_folder(config.changed(source_path=str(scene_of(Path(source)))), folder)
         source = scene_for(source, processes.count, threads=machine.threads, quiet=quiet, **options)
     more = -(iterations - done) % processes.images  # whole steps
     if more and not config.learn.minutes:

@@ -218,7 +218,10 @@ FIXED_OPTIONS = {
     "start_ply": "it goes on from its own Gaussians",
     "seed": "random numbers continue from the checkpoint's",
     "preset": "other options are those of the checkpoint; name the ones to change",
+    **dict.fromkeys(("exposure", "vignetting", "pose_intrinsics"), "what one has learned is nothing to the other"),
 }
+#: Of these, what cannot change only where a part has learned by it.
+FIXED_BY_PARTS = {"exposure": "exposure", "vignetting": "exposure", "pose_intrinsics": "pose"}
 
 
 def schedule_of(config: TrainConfig) -> dict[str, int]:

@@ -168,10 +168,8 @@ def how_to_continue(folder: Path, processes: Processes) -> str:
 def finish(trainer: Trainer, run: Run, say: Report) -> None:
     """Pictures, curves and numbers of the saved model, and where they lie."""
     assert run.saved
-    wall, speed = (
-        time.perf_counter() - run.start,
-        run.seconds and run.iteration / run.seconds,
-    )  # a clock may stand still
+    wall = time.perf_counter() - run.start
+    speed = run.iteration / run.seconds if run.seconds else 0.0  # a clock may stand still
     for place in (run.folder / "point_cloud").glob("iteration_*"):
         if (number := place.name.removeprefix("iteration_")).isdecimal() and int(number) > run.iteration:
             kept = place.rename(place.with_name(f"{place.name}.{place.stat().st_mtime_ns}"))
